@@ -27,7 +27,7 @@ from calib.errors import CalibError
 from calib.gap.case import Case
 from calib.gap.diagnose import screened_ranking, verdict
 from calib.gap.effects import EFFECTS
-from calib.gap.inclusion import UNLISTED, inclusion_probability
+from calib.gap.mixture import UNLISTED, inclusion_probability
 from calib.models import get_model
 from challenge.score import Proportion
 

@@ -26,8 +26,8 @@ from calib.gap.case import Case, read_case
 from calib.gap.diagnose import diagnose
 from calib.gap.hypotheses import split_testable
 from calib.gap.noise import noise_conditions
+from calib.gap.ranking import Lab, calibrate_lab
 from calib.gap.well_specified import Draw, draw_from_hypothesis
-from calib.gap.which import Lab, calibrate_lab
 
 DEPARTURE = 0.15
 SIZES = (20.0, 12.0)

@@ -21,13 +21,13 @@ from unittest.mock import patch
 
 import numpy as np
 
-from calib.gap import sets
+from calib.gap import search
 from calib.gap.batch import case_folders
 from calib.gap.campaigns import campaigns
 from calib.gap.case import read_case
 from calib.gap.effects import EFFECTS
-from calib.gap.inclusion import inclusion_probability
-from calib.gap.which import rank
+from calib.gap.mixture import inclusion_probability
+from calib.gap.ranking import rank
 
 # A search that gives up later, makes more sets of more others, and fits each from all of them.
 WIDER = {
@@ -48,9 +48,9 @@ def found(folder: Path, how: str) -> Mapping[str, float]:
     elif how == "listed otherwise":
         names = rng.permutation(names).tolist()
     elif how == "other pairs first":
-        patches = patch.object(sets, "_pair_seeds", lambda m, _: rng.permutation(m)[:4].tolist())
+        patches = patch.object(search, "_pair_seeds", lambda m, _: rng.permutation(m)[:4].tolist())
     elif how == "several times as wide":
-        patches = patch.multiple(sets, **WIDER)
+        patches = patch.multiple(search, **WIDER)
     with patches:
         ranking = rank(campaigns(read_case(folder)), seed, effects={n: EFFECTS[n] for n in names})
     return inclusion_probability(ranking.probability)

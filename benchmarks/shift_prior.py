@@ -23,12 +23,11 @@ from calib.batch.tasks import completed
 from calib.batch.threads import one_thread
 from calib.gap.campaigns import OutputData, campaigns
 from calib.gap.case import read_case
+from calib.gap.discrepancy import alone_sd, coordinates
 from calib.gap.fit import Fit, fit
 from calib.gap.forward import Forward
-from calib.gap.hypotheses import SHIFTS
-from calib.gap.hypothesis import Hypothesis
-from calib.gap.shifts import alone_sd, coordinates
-from calib.gap.which import calibrate_lab
+from calib.gap.hypotheses import SHIFTS, Hypothesis
+from calib.gap.ranking import calibrate_lab
 from challenge.design import Tier
 from challenge.make import make_case
 

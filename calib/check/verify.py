@@ -27,7 +27,7 @@ from calib.data.files import decoded, inside
 from calib.data.quantities import OUTPUTS
 from calib.data.reader import KNOWN_DATA, label_of
 from calib.errors import FAULTS, CalibError
-from calib.gap.consistent import mispredicted, misquoted
+from calib.gap.files import mispredicted, misquoted
 from calib.inference.prior_files import default_priors
 from calib.inference.record import (
     Entry,

@@ -57,13 +57,12 @@ def diagnose(
     from calib.cli.options import progress_bars
     from calib.cli.simulators import keep_emulators, prepare_case, say
     from calib.data.quantities import OUTPUTS, QUANTITIES
+    from calib.gap.batch import INPUTS, inputs_record
     from calib.gap.case import case_from_run, read_case
     from calib.gap.diagnose import diagnose as find
     from calib.gap.effects import EFFECTS
-    from calib.gap.effects.check import check_effects
-    from calib.gap.effects.load import load_effects
+    from calib.gap.effects.user import check_effects, load_effects
     from calib.gap.files import write_diagnosis
-    from calib.gap.provenance import INPUTS, inputs_record
     from calib.report.gap_evidence import gap_verdict
     from calib.report.gap_facts import track_record_text
     from calib.report.numbers import format_number
@@ -160,7 +159,7 @@ def effects(
 ) -> None:
     """List the effects that a diagnosis knows; of one also equation, what it needs, and priors."""
     from calib.gap.effects import EFFECTS
-    from calib.gap.effects.load import load_effects
+    from calib.gap.effects.user import load_effects
     from calib.report.labels import declared, effect_facts, role_columns
 
     known = {**EFFECTS, **({} if effects is None else load_effects(effects))}

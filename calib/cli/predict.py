@@ -151,7 +151,7 @@ def _predict_corrected(
     from calib.data import read_for_model
     from calib.gap.corrected import conditions_outside, load_corrected, predict_columns
     from calib.gap.effects import EFFECTS
-    from calib.gap.effects.load import load_effects
+    from calib.gap.effects.user import load_effects
 
     load_files(sorted((run / "emulators").glob("*.npz")))
     own = {} if effects is None else load_effects(effects)

@@ -20,16 +20,14 @@ from calib.data import Table, write_table
 from calib.data.quantities import OUTPUTS, role_of
 from calib.errors import CalibError
 from calib.gap.campaigns import Campaigns, campaigns
-from calib.gap.case import read_case
-from calib.gap.declared import cells, with_declared
+from calib.gap.case import cells, read_case, with_declared
+from calib.gap.discrepancy import ShiftMap
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.fit import Fit
 from calib.gap.forward import Forward
-from calib.gap.hypotheses import effect_priors, with_own
-from calib.gap.hypothesis import Hypothesis
+from calib.gap.hypotheses import Hypothesis, effect_priors, with_own
 from calib.gap.mixture import Mixture, Truth
 from calib.gap.noise import Noise
-from calib.gap.shifts import ShiftMap
 from calib.inference.priors import Priors
 from calib.models.base import Array
 from calib.validation.prediction import echoed, outside

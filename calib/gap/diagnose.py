@@ -1,9 +1,9 @@
-"""Diagnose a case: isolability, where, which, how far."""
+"""Diagnose a case: where the gap lies, which cause it has, how far it shrinks."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +13,7 @@ from calib.batch.pool import HERE, Pool
 from calib.batch.threads import one_thread
 from calib.data.quantities import OUTPUTS, columns_of, role_of
 from calib.gap.campaigns import MIN_FIELD_ROWS, Campaigns, campaigns
-from calib.gap.case import Case, read_case
-from calib.gap.context import Context
+from calib.gap.case import Case, Context, new_values, read_case
 from calib.gap.corrected import (
     Corrected,
     NewPrediction,
@@ -23,16 +22,27 @@ from calib.gap.corrected import (
     predict_new,
     shrink,
 )
-from calib.gap.declared import new_values
-from calib.gap.doubts import doubts
 from calib.gap.effects import EFFECTS, Effect, View
-from calib.gap.effects.check import check_effects
+from calib.gap.effects.user import check_effects
+from calib.gap.fit import Fit
 from calib.gap.hypotheses import inseparable, singles, with_own
-from calib.gap.inclusion import UNLISTED, Inclusion, inclusion, inclusion_probability
-from calib.gap.isolate import Isolability
-from calib.gap.mixture import Truth, mixture
-from calib.gap.next_measurement import NextMeasurement, next_measurements
-from calib.gap.oddities import oddities
+from calib.gap.identifiability import Isolability, NextMeasurement, next_measurements
+from calib.gap.mixture import (
+    UNLISTED,
+    Inclusion,
+    Region,
+    RowGap,
+    Truth,
+    inclusion,
+    inclusion_probability,
+    mixture,
+    regions,
+    row_gaps,
+    unused_rows,
+)
+from calib.gap.noise import noise_conditions
+from calib.gap.plausibility import doubts, oddities
+from calib.gap.ranking import Lab, Ranking, calibrate_lab, rank
 from calib.gap.screening import (
     MOST_ROUNDS,
     left_over,
@@ -40,8 +50,6 @@ from calib.gap.screening import (
     without_field_outliers,
     without_outputs,
 )
-from calib.gap.where import Region, RowGap, regions, row_gaps, unused_rows
-from calib.gap.which import Lab, Ranking, calibrate_lab, rank
 from calib.inference.random import generator
 from calib.models.base import Array
 from calib.validation.assumptions import Remark
@@ -183,7 +191,7 @@ def diagnose_once(case: Case, seed: int, effects: Mapping[str, Effect] = EFFECTS
         regions(data, truth, gaps),
         far,
         {} if case.new_conditions is None else predict_new(at_target, before),
-        next_measurements(data, ranking, seed),
+        next_measurements(data, ranking.in_play, seed),
         corrected,
         seed,
         causes,
@@ -335,3 +343,83 @@ def verdict(probability: Mapping[str, float]) -> str:
     acting = inclusion_probability(probability)
     acting.pop(UNLISTED, None)
     return "effect" if max(acting.values(), default=0.0) >= NAMED else "ambiguous"
+
+
+@dataclass(frozen=True)
+class Placebo:
+    """What each single hypothesis leaves of the gap on the field rows.
+
+    Parameters
+    ----------
+    left : mapping of str to float
+        Root-mean-square residual over the noise of the best hypothesis, all outputs.
+    before : float
+        The same for the simulator as it was calibrated.
+    """
+
+    left: dict[str, float]
+    before: float
+
+    def shrink(self, name: str) -> float:
+        """Part of the misfit that a hypothesis removes."""
+        return 1.0 - self.left[name] / self.before
+
+
+def placebos(found: Diagnosis) -> Placebo:
+    """Work out what every single hypothesis leaves on the rows it was fitted to.
+
+    A fit's own residuals are standardised by its own noise, which a wrong hypothesis inflates:
+    they are put on the noise of the best hypothesis first.
+    """
+    at = noise_conditions(found.data.view)
+    best = found.ranking.best(found.ranking.order[0])
+    rows = {o.name: o.rows for o in found.data.outputs}
+    reference = {o: n.sd(at.rows(rows[o])) for o, n in best.noise.items()}
+    left = {}
+    for name in found.ranking.fits:
+        if "+" in name and name != found.ranking.order[0]:
+            continue
+        fit = found.ranking.best(name)
+        left[name] = _rms(
+            [
+                r * fit.noise[o].sd(at.rows(rows[o])) / reference[o]
+                for o, r in fit.field_residuals.items()
+            ]
+        )
+    before = found.corrected.calibrated(found.data.view.conditions)
+    response = [
+        (o.field - o.problem.bound.to_response(before[o.name][o.rows])) / reference[o.name]
+        for o in found.data.outputs
+    ]
+    return Placebo(left, _rms(response))
+
+
+def _rms(parts: list[Array]) -> float:
+    values = np.concatenate(parts)
+    return float(np.sqrt(np.nanmean(np.square(values))))
+
+
+@dataclass(frozen=True)
+class _Asked(View):
+    """A view that notes which defaults its effects have used."""
+
+    defaults: dict[str, float] = field(default_factory=dict)
+
+    def lab_of(self, role: str, otherwise: float | None = None) -> float:
+        """Return the median in the calibration data, and note where there is none."""
+        column, value = self.column(role) or role, super().lab_of(role, otherwise)
+        if column not in self.lab:
+            self.defaults[column] = value
+        return value
+
+
+def assumed(fit: Fit) -> dict[str, float]:
+    """Return what a hypothesis assumes of the calibration, by canonical column, in its unit.
+
+    Where the assumption is wrong, the whole field differs from what its effects say by a constant
+    factor or offset, which another cause may then be named for.
+    """
+    view = fit.forward.data.view
+    asked = _Asked(**{f.name: getattr(view, f.name) for f in fields(View)})
+    fit.forward.field(fit.psi[None], asked)
+    return dict(asked.defaults)

@@ -1,24 +1,77 @@
-"""What a diagnosis writes: diagnosis.json, fresh_prediction.csv (see the contract)."""
+"""The files of a diagnosis: written, checked against each other, compared with a track record."""
 
 from __future__ import annotations
 
 import json
+import tomllib
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.special import betaincinv
 
 from calib.data import write_table
+from calib.data.files import inside
 from calib.data.quantities import OUTPUTS
-from calib.gap.corrected import save_corrected
-from calib.gap.declared import words_of
+from calib.errors import FAULTS, CalibError
+from calib.gap.case import words_of
+from calib.gap.corrected import load_corrected, save_corrected
 from calib.gap.diagnose import Diagnosis
 from calib.gap.fit import Fit
-from calib.gap.inclusion import Included
-from calib.gap.track_record import BENCH, track_record
-from calib.gap.where import Region, row_gaps
+from calib.gap.mixture import Included, Region, row_gaps
 from calib.models.base import Array
+
+# What the cases are, which is not what a user has.
+BENCH = (
+    "simulated campaigns of calib's own bench, whose mechanics share no formula with the "
+    "diagnosis; no measured ones"
+)
+
+
+@dataclass(frozen=True)
+class TrackRecord:
+    """Blind cases whose first explanation was stated between two ends, and how many were right."""
+
+    low: float
+    high: float
+    cases: int
+    right: int
+
+    @property
+    def share(self) -> float:
+        """Part of them that was right."""
+        return self.right / self.cases
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Jeffreys 95 % interval of that part, closed at the ends where all or none were right."""
+        a, b = self.right + 0.5, self.cases - self.right + 0.5
+        low = float(betaincinv(a, b, 0.025)) if self.right else 0.0
+        high = float(betaincinv(a, b, 0.975)) if self.right < self.cases else 1.0
+        return low, high
+
+
+def track_record(probability: float) -> TrackRecord:
+    """Return the record of the bin that the probability of a first explanation lies in."""
+    return next(r for r in reversed(_records()) if probability >= r.low)
+
+
+@cache
+def _records() -> tuple[TrackRecord, ...]:
+    """The bins in order, all seeds together."""
+    text = files("calib.gap").joinpath("track_record.toml").read_text(encoding="utf-8")
+    pooled: dict[tuple[float, float], list[int]] = {}
+    for record in tomllib.loads(text)["record"]:
+        for low, high, cases, right in record["bins"]:
+            sums = pooled.setdefault((low, high), [0, 0])
+            sums[0] += cases
+            sums[1] += right
+    return tuple(TrackRecord(*ends, *sums) for ends, sums in sorted(pooled.items()))
+
 
 SCHEMA = "calib/diagnosis/1"
 
@@ -190,3 +243,41 @@ def write_diagnosis(found: Diagnosis, folder: Path) -> None:
         columns[f"{column}_after_lower"] = prediction.lower
         columns[f"{column}_after_upper"] = prediction.upper
     write_table(folder / "fresh_prediction.csv", columns)
+
+
+# Of the sd of a gap; and a gap that is nil, in kN, mm or g/cm^3.
+_OF_SD, _ROUNDING = 0.3, 1e-6
+
+
+def misquoted(said: Any, folder: Path) -> str:
+    """Say which entries of an `answer` are not those of a diagnosis folder; nothing if all are."""
+    try:
+        stated = answer(_diagnosis(folder))
+    except FAULTS:
+        return "the diagnosis is not a whole one"
+    apart = [key for key, value in stated.items() if inside(said).get(key) != value]
+    return f"not the same: {', '.join(apart)}" if apart else ""
+
+
+def mispredicted(folder: Path) -> str:
+    """Say what is wrong with a corrected model that does not predict the gaps of its diagnosis.
+
+    It is drawn from, and a normal may be drawn otherwise by another processor: the means of
+    hundreds of draws agree within a third of their sd.
+    """
+    try:
+        corrected = load_corrected(folder)
+        where = _diagnosis(folder)["where"]
+        stated = {(e["output"], e["row"]): (e["gap"], e["gap_sd"]) for e in where}
+        for g in row_gaps(corrected.data, corrected.mixture.at(corrected.data.view)):
+            pairs = np.array([stated[g.output, int(row)] for row in g.rows], dtype=np.float64)
+            apart = np.abs(np.stack([g.gap, g.sd], axis=1) - pairs)
+            if (apart > _OF_SD * pairs[:, 1:] + _ROUNDING).any():
+                return "it does not predict the gaps that diagnosis.json states"
+    except (CalibError, *FAULTS) as error:
+        return f"it cannot be held against its diagnosis ({type(error).__name__}: {error})"
+    return ""
+
+
+def _diagnosis(folder: Path) -> Any:
+    return json.loads((folder / "diagnosis.json").read_bytes())

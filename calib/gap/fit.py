@@ -17,10 +17,21 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import log_ndtr
 
-from calib.gap.ascent import FIRST_STEPS, Ascent, Slope, Stack, climb, slopes, stacked
 from calib.gap.forward import Forward
+from calib.gap.gauss_newton import (
+    FIRST_STEPS,
+    Ascent,
+    Residuals,
+    Slope,
+    Stack,
+    climb,
+    diagonal,
+    residuals_of_all,
+    slopes,
+    stacked,
+    variance_left,
+)
 from calib.gap.noise import Noise, ln_averaging, ln_prior
-from calib.gap.residuals import Residuals, diagonal, residuals_of_all, variance_left
 from calib.models.base import Array
 
 _MAX_STEPS = 40

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from calib.gap.campaigns import Campaigns
-from calib.gap.context import Context
+from calib.gap.case import Context
 from calib.gap.fit import Fit
 from calib.gap.forward import Forward, fields_of_all
 from calib.gap.hypotheses import LN_PAIR_TO_SINGLE, LN_PRIOR, REMAINDER

@@ -23,11 +23,10 @@ from calib.errors import CalibError
 from calib.gap.campaigns import Campaigns, campaigns
 from calib.gap.case import read_case
 from calib.gap.forward import Forward
-from calib.gap.hypotheses import joined, shifts, singles, split_testable, unknowns
-from calib.gap.hypothesis import Hypothesis
+from calib.gap.hypotheses import Hypothesis, joined, shifts, singles, split_testable, unknowns
 from calib.gap.noise import Noise, noise_conditions
 from calib.gap.odds import RELEVANT_IN_PAIR, sizes
-from calib.gap.which import calibrate_lab
+from calib.gap.ranking import calibrate_lab
 from calib.inference.random import generator
 from calib.models.base import Array
 

@@ -8,15 +8,13 @@ from dataclasses import replace
 import numpy as np
 
 from calib.data.quantities import OUTPUTS, role_of
-from calib.gap.assumed import assumed
+from calib.gap.case import words_of
 from calib.gap.corrected import Shrink
-from calib.gap.declared import words_of
-from calib.gap.diagnose import Diagnosis
+from calib.gap.diagnose import Diagnosis, assumed
 from calib.gap.effects import EFFECTS
 from calib.gap.fit import Fit
-from calib.gap.inclusion import UNLISTED, Included
-from calib.gap.next_measurement import NextMeasurement
-from calib.gap.where import Region
+from calib.gap.identifiability import NextMeasurement
+from calib.gap.mixture import UNLISTED, Included, Region
 from calib.models import get_model
 from calib.report.gap_facts import (
     SHOWN,

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from calib.data.files import plain_number
 from calib.data.quantities import OUTPUTS, role_of
-from calib.gap.declared import words_of
+from calib.gap.case import words_of
 from calib.gap.diagnose import Diagnosis, field_parts
 from calib.gap.effects import EFFECTS
-from calib.gap.track_record import BENCH, track_record
-from calib.gap.where import Region
+from calib.gap.files import BENCH, track_record
+from calib.gap.mixture import Region
 from calib.models.base import Array
 from calib.report.labels import MINUS, NO_UNIT, Axis, axis_of, joined, odds_text, percent_range
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.data.quantities import physical_role, role_of
-from calib.gap.covariates import columns_over
-from calib.gap.declared import words_of
+from calib.gap.campaigns import columns_over
+from calib.gap.case import words_of
 from calib.gap.diagnose import Diagnosis
 from calib.gap.effects import Effect
 from calib.gap.fit import Fit
@@ -18,13 +18,7 @@ from calib.gap.noise import noise_conditions
 from calib.inference.random import generator
 from calib.models import get_model
 from calib.models.base import Array
-from calib.report.gap_facts import (
-    EVERYWHERE,
-    output_axis,
-    output_word,
-    region_text,
-    unit_after,
-)
+from calib.report.gap_facts import EVERYWHERE, output_axis, output_word, region_text, unit_after
 from calib.report.labels import axis_of, joined
 from calib.report.numbers import format_value
 

@@ -30,7 +30,7 @@ from scipy.special import softmax
 from calib.gap.diagnose import Diagnosis
 from calib.gap.effects import Effect
 from calib.gap.effects.instruments import EARLY
-from calib.gap.inclusion import UNLISTED
+from calib.gap.mixture import UNLISTED
 from calib.report.gap_facts import (
     MOST_TIED,
     NEITHER,

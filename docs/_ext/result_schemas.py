@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from calib.gap.context import Size
+from calib.gap.case import Size
 
 type Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 type Interval = Annotated[list[float], Field(min_length=2, max_length=2)]

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calib.errors import CalibError
-from calib.gap.provenance import INPUTS, case_hashes
+from calib.gap.batch import INPUTS, case_hashes
 from challenge.answers import CaseAnswer, CauseAnswer, auc
 from challenge.figures import levels_figure, reliability_figure
 from challenge.files import OUTPUT_COLUMNS

@@ -15,7 +15,7 @@ from calib.gap.campaigns import Campaigns, campaigns
 from calib.gap.case import Case
 from calib.gap.diagnose import Diagnosis, diagnose
 from calib.gap.effects import EFFECTS, Effect
-from calib.gap.which import Ranking
+from calib.gap.ranking import Ranking
 from calib.inference.prior_files import default_priors, read_priors
 from calib.inference.problem import build_problem
 

@@ -9,9 +9,9 @@ import numpy as np
 from calib.gap.campaigns import Campaigns, OutputData, campaigns
 from calib.gap.fit import Fit
 from calib.gap.forward import Forward
-from calib.gap.hypothesis import Hypothesis
+from calib.gap.gauss_newton import Residuals, variance_left
+from calib.gap.hypotheses import Hypothesis
 from calib.gap.noise import Noise, ln_averaging, noise_conditions_of_lab
-from calib.gap.residuals import Residuals, variance_left
 from calib.inference.priors import Prior, Priors
 from tests.custom_problems import normal, problem_of
 from tests.gap.cases import NOISE, PULL_ONLY, make_case

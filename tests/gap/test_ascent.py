@@ -7,26 +7,26 @@ from copy import copy
 import numpy as np
 import pytest
 
-import calib.gap.ascent as module
-from calib.gap.ascent import (
+import calib.gap.gauss_newton as module
+from calib.gap.campaigns import Campaigns, campaigns
+from calib.gap.fit import Fit, Start, finished, truncated_fits
+from calib.gap.forward import Forward
+from calib.gap.gauss_newton import (
     Ascent,
+    Residuals,
     Slope,
     Stack,
     _change,
     _directions,
     _step,
     climb,
+    residuals_of_all,
     slopes,
     stacked,
     together,
 )
-from calib.gap.campaigns import Campaigns, campaigns
-from calib.gap.fit import Fit, Start, finished, truncated_fits
-from calib.gap.forward import Forward
-from calib.gap.hypotheses import joined, shifts, singles, split_testable, unknowns
-from calib.gap.hypothesis import Hypothesis
+from calib.gap.hypotheses import Hypothesis, joined, shifts, singles, split_testable, unknowns
 from calib.gap.noise import Noise
-from calib.gap.residuals import Residuals, residuals_of_all
 from tests.gap.cases import NOISE, make_case
 from tests.gap.fits import straight_line
 

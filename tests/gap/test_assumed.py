@@ -7,11 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.gap.assumed import assumed
 from calib.gap.campaigns import campaigns
+from calib.gap.diagnose import assumed
 from calib.gap.effects import EFFECTS
-from calib.gap.hypotheses import joined, singles
-from calib.gap.hypothesis import Hypothesis
+from calib.gap.hypotheses import Hypothesis, joined, singles
 from tests.gap.cases import make_case, table_without
 from tests.gap.fits import fit_at
 

@@ -13,7 +13,7 @@ from calib.data import table_from_arrays
 from calib.errors import CalibError
 from calib.gap.campaigns import campaigns
 from calib.gap.case import Case
-from calib.gap.oddities import oddities
+from calib.gap.plausibility import oddities
 from calib.inference.prior_files import DeclaredPriors, default_priors
 from tests.gap.cases import PULL_ONLY, make_case, table_without
 

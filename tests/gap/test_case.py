@@ -10,12 +10,12 @@ import pytest
 
 from calib.data import write_table
 from calib.errors import CalibError
+from calib.gap.batch import case_hashes, inputs_record
 from calib.gap.campaigns import campaigns
 from calib.gap.case import case_files, case_from_run, read_case
 from calib.gap.corrected import load_corrected, save_corrected
 from calib.gap.diagnose import diagnose_once
 from calib.gap.effects import EFFECTS
-from calib.gap.provenance import case_hashes, inputs_record
 from calib.inference.calibration import calibrate
 from calib.inference.io import save_calibration
 from calib.inference.prior_files import DeclaredPriors, default_priors

@@ -13,8 +13,8 @@ from calib.errors import CalibError
 from calib.gap.case import Case, read_case
 from calib.gap.diagnose import screened_ranking
 from calib.gap.effects import EFFECTS
-from calib.gap.oddities import oddities
-from calib.gap.where import check_units, without_far_conditions
+from calib.gap.plausibility import oddities
+from calib.gap.screening import check_units, without_far_conditions
 from tests.gap.cases import PULL_ONLY, make_case, write_case
 
 

@@ -9,10 +9,9 @@ import pytest
 from pydantic import ValidationError
 
 from calib.errors import CalibError
-from calib.gap.case import read_case
-from calib.gap.context import Context, Size, read_context
+from calib.gap.case import Context, Size, read_case, read_context
 from calib.gap.diagnose import diagnose_once
-from calib.gap.hypothesis import Hypothesis
+from calib.gap.hypotheses import Hypothesis
 from calib.gap.odds import Odds
 from calib.inference.priors import Prior, Priors
 from calib.report.gap_evidence import gap_evidence

@@ -24,11 +24,10 @@ from calib.gap.corrected import (
 )
 from calib.gap.diagnose import diagnose
 from calib.gap.effects import EFFECTS
-from calib.gap.effects.load import load_effects
+from calib.gap.effects.user import load_effects
 from calib.gap.fit import Fit
 from calib.gap.forward import Forward
-from calib.gap.hypotheses import joined, readings, singles
-from calib.gap.hypothesis import Hypothesis
+from calib.gap.hypotheses import Hypothesis, joined, readings, singles
 from calib.gap.mixture import Mixture
 from calib.gap.noise import Noise
 from calib.inference.prior_files import DeclaredPriors, default_priors

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.gap.campaigns import campaigns
-from calib.gap.covariates import Covariates, columns_over, other_conditions
+from calib.gap.campaigns import Covariates, campaigns, columns_over, other_conditions
 from tests.gap.cases import PULL_ONLY, make_case, table_without
 
 

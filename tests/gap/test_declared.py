@@ -11,13 +11,19 @@ import pytest
 
 from calib.data import Table, read_table
 from calib.errors import CalibError
-from calib.gap.case import read_case
+from calib.gap.batch import case_hashes, inputs_record
+from calib.gap.case import (
+    cells,
+    declared_covariates,
+    new_values,
+    read_case,
+    with_declared,
+    words_of,
+)
 from calib.gap.corrected import load_corrected, predict_columns, save_corrected
-from calib.gap.declared import cells, declared_covariates, new_values, with_declared, words_of
 from calib.gap.diagnose import diagnose_once
 from calib.gap.effects import EFFECTS
 from calib.gap.files import document
-from calib.gap.provenance import case_hashes, inputs_record
 from calib.report.figures.gap_where import conditions_plate
 from calib.report.gap_facts import region_text
 from tests.gap.cases import PULL_ONLY, make_case, write_case

@@ -7,14 +7,12 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal, norm
 
-from calib.gap.density import Density
 from calib.gap.fit import Fit, fit
 from calib.gap.forward import Forward
-from calib.gap.hypotheses import singles, unknowns, with_remainder
-from calib.gap.hypothesis import Hypothesis
+from calib.gap.gauss_newton import Residuals
+from calib.gap.hypotheses import Hypothesis, singles, unknowns, with_remainder
+from calib.gap.importance import Density, refine
 from calib.gap.noise import KAPPA, RHO, Noise, ln_prior
-from calib.gap.refine import refine
-from calib.gap.residuals import Residuals
 from tests.gap.cases import CHOICE, campaigns_of
 from tests.gap.fits import SIGMA, averaged_log_joint, lifted, log_joint
 

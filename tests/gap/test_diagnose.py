@@ -12,7 +12,7 @@ import calib.gap.diagnose as module
 from calib.batch.pool import HERE
 from calib.data import table_from_arrays
 from calib.gap.campaigns import campaigns
-from calib.gap.context import Context
+from calib.gap.case import Context
 from calib.gap.diagnose import (
     _beyond,
     _confounded,
@@ -24,7 +24,7 @@ from calib.gap.diagnose import (
     with_unseen_rows,
 )
 from calib.gap.effects import EFFECTS
-from calib.gap.inclusion import Included
+from calib.gap.mixture import Included
 from tests.gap.cases import PULL_ONLY, make_case
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from calib.gap.campaigns import Campaigns, campaigns
 from calib.gap.discrepancy import Discrepancy
-from calib.gap.hypothesis import Hypothesis
+from calib.gap.hypotheses import Hypothesis
 from tests.gap.cases import campaigns_of, make_case
 
 PULL = ("drawbar_pull",)

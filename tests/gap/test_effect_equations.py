@@ -15,8 +15,7 @@ import pytest
 
 from calib.data.quantities import role_of
 from calib.gap.effects import EFFECTS, Effect, View
-from calib.gap.effects.dependence import DependsOn, DiffersBy
-from calib.gap.effects.readings import ReadingDrift, ReadingStep
+from calib.gap.effects.dependence import DependsOn, DiffersBy, ReadingDrift, ReadingStep
 from calib.inference.prior_files import DeclaredPriors, read_priors
 from calib.inference.priors import Priors
 

@@ -12,7 +12,7 @@ from calib.gap.campaigns import Campaigns, campaigns
 from calib.gap.case import Case
 from calib.gap.fit import fit
 from calib.gap.forward import Forward
-from calib.gap.hypothesis import Hypothesis
+from calib.gap.hypotheses import Hypothesis
 from calib.gap.noise import Noise
 from calib.inference.emulation.prepared import prepare
 from calib.inference.likelihood import log_normal

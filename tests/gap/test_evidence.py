@@ -12,17 +12,11 @@ from scipy.stats import multivariate_normal, norm
 
 import calib.gap.fit as module
 from calib.gap.campaigns import Campaigns
-from calib.gap.density import Density
 from calib.gap.fit import Fit, _bounds_correction, _near, _within, finished, fit
 from calib.gap.forward import Forward
-from calib.gap.hypothesis import Hypothesis
-from calib.gap.noise import (
-    KAPPA,
-    RHO,
-    Noise,
-    ln_prior,
-)
-from calib.gap.refine import _Pool, refine
+from calib.gap.hypotheses import Hypothesis
+from calib.gap.importance import Density, _Pool, refine
+from calib.gap.noise import KAPPA, RHO, Noise, ln_prior
 from calib.inference.priors import Prior
 from calib.inference.sampling.mixture import StudentT
 from tests.gap.fits import averaged_log_joint, lifted, straight_line

@@ -16,18 +16,11 @@ from calib.gap.effects import EFFECTS
 from calib.gap.files import _parameters, document, write_diagnosis
 from calib.gap.fit import Fit
 from calib.gap.forward import Forward
-from calib.gap.hypothesis import Hypothesis
-from calib.gap.next_measurement import NextMeasurement
-from calib.gap.where import Region
+from calib.gap.hypotheses import Hypothesis
+from calib.gap.identifiability import NextMeasurement
+from calib.gap.mixture import Region
 from calib.inference.priors import Prior, Priors
-from tests.gap.cases import (
-    CHOICE,
-    PULL_ONLY,
-    diagnosis_of,
-    make_case,
-    pull_diagnosis,
-    write_case,
-)
+from tests.gap.cases import CHOICE, PULL_ONLY, diagnosis_of, make_case, pull_diagnosis, write_case
 
 
 @pytest.fixture(scope="module")

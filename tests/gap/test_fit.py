@@ -19,10 +19,9 @@ from calib.gap.case import Case
 from calib.gap.effects import EFFECTS
 from calib.gap.fit import Fit, _ln_mass, fit
 from calib.gap.forward import Forward
-from calib.gap.hypotheses import effect_priors
-from calib.gap.hypothesis import Hypothesis
+from calib.gap.hypotheses import Hypothesis, effect_priors
+from calib.gap.importance import refine
 from calib.gap.noise import KAPPA, RHO, Noise, ln_prior
-from calib.gap.refine import refine
 from tests.gap.cases import PULL_ONLY, make_case
 from tests.gap.fits import averaged_log_joint
 

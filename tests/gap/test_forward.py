@@ -10,10 +10,11 @@ import pytest
 
 from calib.data.quantities import role_of
 from calib.gap.campaigns import campaigns
-from calib.gap.departed import Departed
+from calib.gap.discrepancy import shift_map
 from calib.gap.effects import EFFECTS, Effect
-from calib.gap.forward import Forward, fields_of_all
+from calib.gap.forward import Departed, Forward, fields_of_all
 from calib.gap.hypotheses import (
+    Hypothesis,
     effect_priors,
     joined,
     shifts,
@@ -22,8 +23,6 @@ from calib.gap.hypotheses import (
     unknowns,
     with_remainder,
 )
-from calib.gap.hypothesis import Hypothesis
-from calib.gap.shifts import shift_map
 from calib.inference.priors import Prior, Priors
 from tests.gap.cases import NOISE, campaigns_of, make_case
 from tests.gap.test_hypotheses import density_campaigns

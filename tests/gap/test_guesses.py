@@ -8,16 +8,15 @@ import numpy as np
 import pytest
 
 from calib.gap.campaigns import campaigns
-from calib.gap.context import Context
+from calib.gap.case import Context
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.fit import Start
 from calib.gap.forward import Forward
-from calib.gap.guesses import Guesses, _led, _places
-from calib.gap.hypotheses import joined, singles, unknowns
-from calib.gap.hypothesis import Hypothesis
+from calib.gap.gauss_newton import Residuals
+from calib.gap.hypotheses import Hypothesis, joined, singles, unknowns
 from calib.gap.noise import Noise
 from calib.gap.odds import Odds
-from calib.gap.residuals import Residuals
+from calib.gap.search import Guesses, _led, _places
 from tests.gap.cases import CHOICE, campaigns_of, make_case
 from tests.gap.fits import SIGMA, fit_at
 

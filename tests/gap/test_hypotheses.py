@@ -17,6 +17,7 @@ from calib.gap.forward import Forward
 from calib.gap.hypotheses import (
     COVERED,
     SHIFTS,
+    Hypothesis,
     aside,
     covered,
     dependences,
@@ -33,7 +34,6 @@ from calib.gap.hypotheses import (
     with_own,
     with_remainder,
 )
-from calib.gap.hypothesis import Hypothesis
 from calib.report.gap_sizes import size_sentences
 from tests.gap.cases import MODELS, NOISE, PULL_ONLY, campaigns_of, make_case, table_without
 

@@ -21,7 +21,7 @@ def _imported(statement: str) -> list[str]:
 def test_a_diagnosis_needs_no_sampler_no_figures_and_no_data_frames():
     # Whether a simulator has to be emulated is looked at first.
     found = _imported("import calib.inference.emulation.prepared, calib.gap.diagnose")
-    assert "calib.gap.which" in found
+    assert "calib.gap.ranking" in found
     assert [name for name in _HEAVY if name in found] == []
 
 

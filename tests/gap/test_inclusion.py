@@ -8,13 +8,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import calib.gap.inclusion as module
+import calib.gap.mixture as module
 from calib.gap.diagnose import verdict
-from calib.gap.hypotheses import joined, singles
-from calib.gap.hypothesis import Hypothesis
-from calib.gap.inclusion import (
+from calib.gap.hypotheses import Hypothesis, joined, singles
+from calib.gap.mixture import (
     Included,
     Inclusion,
+    Mixture,
     _mean_and_interval,
     _shares,
     _sizes,
@@ -22,7 +22,6 @@ from calib.gap.inclusion import (
     inclusion,
     inclusion_probability,
 )
-from calib.gap.mixture import Mixture
 from tests.gap.cases import CHOICE, LARGE, campaigns_of, diagnosis_of
 from tests.gap.fits import SIGMA, fit_at
 
@@ -76,7 +75,7 @@ def test_a_draw_weighs_what_its_explanation_does():
 
 
 def test_sets_do_not_depend_on_the_order_of_the_effects():
-    from calib.gap.which import rank
+    from calib.gap.ranking import rank
     from tests.gap.cases import campaigns_of
 
     data = campaigns_of("sensor_drift", "pull")

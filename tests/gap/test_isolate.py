@@ -14,10 +14,10 @@ from calib.data import table_from_arrays
 from calib.gap.campaigns import campaigns
 from calib.gap.effects import EFFECTS
 from calib.gap.hypotheses import LN_PRIOR, singles
-from calib.gap.isolate import ALIKE, isolability, smallest_shown
+from calib.gap.identifiability import ALIKE, isolability, smallest_shown
 from calib.gap.noise import Noise
 from calib.gap.odds import RELEVANT
-from calib.gap.which import rank
+from calib.gap.ranking import rank
 from calib.inference.sampling.mode import prior_widths
 from tests.gap.cases import CHOICE, campaigns_of, make_case, ranking_of
 

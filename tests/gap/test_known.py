@@ -8,8 +8,7 @@ import pytest
 from calib.gap.campaigns import campaigns
 from calib.gap.effects import EFFECTS, Effect, Known, View
 from calib.gap.forward import Forward
-from calib.gap.hypotheses import dependences, effect_priors
-from calib.gap.hypothesis import Hypothesis
+from calib.gap.hypotheses import Hypothesis, dependences, effect_priors
 from calib.models.base import Array
 from tests.gap.cases import NOISE, campaigns_of, make_case
 

@@ -10,8 +10,7 @@ from calib.errors import CalibError
 from calib.gap.campaigns import campaigns
 from calib.gap.diagnose import diagnose
 from calib.gap.effects import EFFECTS, Effect
-from calib.gap.effects.check import check_effects
-from calib.gap.effects.load import load_effects
+from calib.gap.effects.user import check_effects, load_effects
 from calib.gap.hypotheses import effect_priors
 from tests.gap.cases import make_case
 

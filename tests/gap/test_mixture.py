@@ -8,8 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from calib.gap.hypotheses import singles
-from calib.gap.hypothesis import Hypothesis
+from calib.gap.hypotheses import Hypothesis, singles
 from calib.gap.mixture import Mixture, Truth, _thinned, mixture
 from calib.gap.noise import Noise
 from tests.gap.cases import CHOICE, campaigns_of

@@ -14,7 +14,7 @@ from calib.gap.campaigns import campaigns
 from calib.gap.diagnose import screened_ranking
 from calib.gap.effects import EFFECTS
 from calib.gap.noise import noise_conditions
-from calib.gap.oddities import _ROUGHLY, _times, identical_rows, oddities
+from calib.gap.plausibility import _ROUGHLY, _times, identical_rows, oddities
 from tests.gap.cases import MODELS, PULL_ONLY, make_case, table_without
 
 PULL, RUT = OUTPUTS["drawbar_pull"], OUTPUTS["rut_depth"]

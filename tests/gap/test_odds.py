@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from calib.gap.context import Context
+from calib.gap.case import Context
 from calib.gap.odds import Odds, probabilities, with_prior
 
 NAMES = [f"cause_{i}" for i in range(5)]

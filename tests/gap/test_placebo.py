@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.gap.placebo import placebos
+from calib.gap.diagnose import placebos
 from tests.gap.cases import diagnosis_of
 
 

@@ -10,14 +10,8 @@ import pytest
 
 from calib.batch.environment import sha256
 from calib.errors import CalibError
+from calib.gap.batch import INPUTS, case_hashes, check_resumable, inputs_record, recorded_inputs
 from calib.gap.case import read_case
-from calib.gap.provenance import (
-    INPUTS,
-    case_hashes,
-    check_resumable,
-    inputs_record,
-    recorded_inputs,
-)
 from tests.gap.cases import PULL_ONLY, make_case, write_case
 
 

@@ -12,11 +12,10 @@ from calib.gap.campaigns import campaigns
 from calib.gap.effects import EFFECTS
 from calib.gap.fit import fit
 from calib.gap.forward import Forward
-from calib.gap.hypotheses import effect_priors
-from calib.gap.hypothesis import Hypothesis
+from calib.gap.hypotheses import Hypothesis, effect_priors
+from calib.gap.importance import _ln_mean, refine
 from calib.gap.noise import Noise
-from calib.gap.refine import _ln_mean, refine
-from calib.gap.which import rank
+from calib.gap.ranking import rank
 from calib.he2019.gaps import paper_gaps
 from tests.gap.cases import make_case
 from tests.gap.fits import averaged_log_joint

@@ -8,14 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.gap.campaigns import campaigns
+from calib.gap.campaigns import Simulated, campaigns
 from calib.gap.effects import EFFECTS
 from calib.gap.forward import Forward
-from calib.gap.hypotheses import singles
-from calib.gap.hypothesis import Hypothesis
+from calib.gap.gauss_newton import Residuals, residuals_of_all, variance_left
+from calib.gap.hypotheses import Hypothesis, singles
 from calib.gap.noise import Noise, most_probable
-from calib.gap.residuals import Residuals, residuals_of_all, variance_left
-from calib.gap.simulated import Simulated
 from tests.gap.cases import NOISE, campaigns_of, make_case
 
 SIGMA = {o: NOISE[o] for o in ("drawbar_pull", "rut_depth")}

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.gap.runs import change_over_runs, follows_runs
+from calib.gap.ranking import change_over_runs, follows_runs
 from tests.gap.cases import campaigns_of, ranking_of
 
 

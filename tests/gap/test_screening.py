@@ -14,6 +14,7 @@ from calib.errors import CalibError
 from calib.gap.campaigns import campaigns
 from calib.gap.diagnose import screened_ranking
 from calib.gap.effects import EFFECTS
+from calib.gap.ranking import calibrate_lab
 from calib.gap.screening import (
     LAB_OUTLIER,
     OUTLIER,
@@ -25,7 +26,6 @@ from calib.gap.screening import (
     without_field_outliers,
     without_outputs,
 )
-from calib.gap.which import calibrate_lab
 from tests.gap.cases import PULL_ONLY, make_case
 
 FEW = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift", "lug_thrust")}

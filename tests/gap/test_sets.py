@@ -12,20 +12,20 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-import calib.gap.sets as module
+import calib.gap.search as module
 from calib.data import table_from_arrays
 from calib.data.quantities import OUTPUTS, physical_role
 from calib.gap.campaigns import campaigns
-from calib.gap.case import Case
-from calib.gap.context import Context
+from calib.gap.case import Case, Context
 from calib.gap.effects import EFFECTS
 from calib.gap.forward import Forward
-from calib.gap.guesses import Guesses, Promise, _led, _places
-from calib.gap.hypotheses import joined, resized, shifts, singles, wider, with_remainder
-from calib.gap.hypothesis import Hypothesis
-from calib.gap.inclusion import inclusion_probability
+from calib.gap.hypotheses import Hypothesis, joined, resized, shifts, singles, wider, with_remainder
+from calib.gap.mixture import inclusion_probability
 from calib.gap.odds import Odds, with_prior
-from calib.gap.sets import (
+from calib.gap.ranking import calibrate_lab, rank
+from calib.gap.search import (
+    Guesses,
+    Promise,
     _as_sized,
     _as_usual,
     _begun_again,
@@ -36,12 +36,13 @@ from calib.gap.sets import (
     _finished,
     _fitted,
     _leading,
+    _led,
     _pairs,
+    _places,
     _promise,
     _stepwise,
     far_out,
 )
-from calib.gap.which import calibrate_lab, rank
 from calib.inference.priors import Priors
 from tests.gap.cases import CHOICE, LARGE, make_case, parameters
 

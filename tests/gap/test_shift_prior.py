@@ -10,11 +10,11 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from calib.gap.discrepancy import ZERO_OF_SLIP, another_soil, quantities
 from calib.gap.fit import Fit
 from calib.gap.forward import Forward
-from calib.gap.hypothesis import Hypothesis
+from calib.gap.hypotheses import Hypothesis
 from calib.gap.noise import Noise
-from calib.gap.shifts import ZERO_OF_SLIP, another_soil, quantities
 from tests.gap.cases import MODELS, NOISE, campaigns_of
 
 SCRIPT = Path(__file__).resolve().parents[2] / "benchmarks" / "shift_prior.py"

@@ -9,23 +9,16 @@ import numpy as np
 import pytest
 
 from calib.errors import CalibError
-from calib.gap import shifts as module
+from calib.gap import discrepancy as module
 from calib.gap.campaigns import campaigns
 from calib.gap.corrected import Corrected, load_corrected, predict_columns, save_corrected
+from calib.gap.discrepancy import DIFFERENCE, RADIUS_ERROR, ZERO_OF_SLIP, another_soil, quantities
 from calib.gap.effects import EFFECTS
 from calib.gap.fit import Fit
 from calib.gap.forward import Forward
-from calib.gap.hypotheses import singles
-from calib.gap.hypothesis import Hypothesis
+from calib.gap.hypotheses import Hypothesis, singles
 from calib.gap.mixture import Mixture
 from calib.gap.noise import Noise
-from calib.gap.shifts import (
-    DIFFERENCE,
-    RADIUS_ERROR,
-    ZERO_OF_SLIP,
-    another_soil,
-    quantities,
-)
 from calib.inference.prior_files import default_priors
 from calib.inference.sampling.mode import prior_widths
 from calib.models import MODELS as KNOWN

@@ -15,7 +15,7 @@ from calib.gap.corrected import predict_new, shrink
 from calib.gap.diagnose import diagnose
 from calib.gap.effects import EFFECTS
 from calib.gap.mixture import Truth, mixture
-from calib.gap.which import rank
+from calib.gap.ranking import rank
 from tests.gap.cases import PULL_ONLY, campaigns_of, diagnosis_of, make_case, write_case
 
 N = 27

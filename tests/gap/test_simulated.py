@@ -8,8 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from calib.gap.campaigns import campaigns
-from calib.gap.simulated import Simulated
+from calib.gap.campaigns import Simulated, campaigns
 from tests.gap.cases import campaigns_of
 from tests.gap.test_hypotheses import density_campaigns
 

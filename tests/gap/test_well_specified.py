@@ -18,8 +18,8 @@ from calib.gap.batch import case_folders, diagnose_cases
 from calib.gap.campaigns import campaigns
 from calib.gap.case import read_case
 from calib.gap.noise import Noise, noise_conditions
+from calib.gap.ranking import calibrate_lab
 from calib.gap.well_specified import SIZE_RATIO, draw_from_hypothesis, well_specified_case
-from calib.gap.which import calibrate_lab
 from challenge.files import OUTPUT_COLUMNS
 from challenge.redraw import redraw
 from challenge.score import score

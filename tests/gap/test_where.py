@@ -11,8 +11,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calib.gap.mixture import Truth, mixture
-from calib.gap.where import RowGap, _region, _stretches, conditions_to_search, regions, row_gaps
+from calib.gap.mixture import (
+    RowGap,
+    Truth,
+    _region,
+    _stretches,
+    conditions_to_search,
+    mixture,
+    regions,
+    row_gaps,
+)
 from tests.gap.cases import campaigns_of, diagnosis_of, ranking_of
 
 NOISE = 0.05

@@ -14,13 +14,12 @@ from calib.data import table_from_arrays
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 from calib.gap.campaigns import campaigns
-from calib.gap.case import Case
-from calib.gap.context import Context
+from calib.gap.case import Case, Context
 from calib.gap.effects import EFFECTS
 from calib.gap.hypotheses import dependences
-from calib.gap.inclusion import inclusion_probability
+from calib.gap.mixture import inclusion_probability
 from calib.gap.odds import RELEVANT, Odds, coarsening, probabilities, sizes
-from calib.gap.which import Ranking, _check_names, _scored, _scores, calibrate_lab, rank
+from calib.gap.ranking import Ranking, _check_names, _scored, _scores, calibrate_lab, rank
 from tests.gap.cases import CHOICE, LARGE, PULL_ONLY, campaigns_of, make_case, ranking_of
 
 
@@ -337,7 +336,7 @@ def test_a_score_is_evidence_times_relevance_times_share(monkeypatch):
     forward = copy(fit.forward)
     forward.hypothesis = hypothesis
     shared = replace(fit, forward=forward)
-    monkeypatch.setattr("calib.gap.which.relevance", lambda asked, _: [-2.0 for _ in asked])
+    monkeypatch.setattr("calib.gap.ranking.relevance", lambda asked, _: [-2.0 for _ in asked])
     assert _scores([(shared, 100), (fit, 100)], 1) == pytest.approx(
         [fit.log_evidence - 2.0 + np.log(0.3), fit.log_evidence - 2.0]
     )
@@ -391,7 +390,7 @@ def refining(monkeypatch, gained: Mapping[str, float]) -> list[str]:
         asked.append(name)
         return variant(name, found.log_evidence + gained[name])
 
-    monkeypatch.setattr("calib.gap.which.refine", refine)
+    monkeypatch.setattr("calib.gap.ranking.refine", refine)
     return asked
 
 
@@ -406,7 +405,7 @@ def test_variants_in_play_are_refined_and_those_far_behind_not_even_drawn(monkey
         asked.extend((found.log_evidence, draws) for found, draws in every if draws)
         return [0.0] * len(every)
 
-    monkeypatch.setattr("calib.gap.which.relevance", relevance)
+    monkeypatch.setattr("calib.gap.ranking.relevance", relevance)
     refining(monkeypatch, dict.fromkeys(("none", "a", "b"), 0.25))
     odds = Odds(1, {})
     base = {n: -odds.ln_prior(n) for n in ("none", "a", "b")}
@@ -432,7 +431,7 @@ def test_variants_in_play_are_refined_and_those_far_behind_not_even_drawn(monkey
 
 def test_what_comes_into_play_when_others_lose_by_their_draws_is_refined_too(monkeypatch):
     """Laplace's evidence of the best was five nats too high: what was behind it is not, then."""
-    monkeypatch.setattr("calib.gap.which.relevance", lambda asked, _: [0.0] * len(asked))
+    monkeypatch.setattr("calib.gap.ranking.relevance", lambda asked, _: [0.0] * len(asked))
     asked = refining(monkeypatch, {"a": -5.0, "b": -0.1, "c": 0.0})
     odds = Odds(1, {})
     at = {"a": 0.0, "b": -5.0, "none": -9.5, "c": -8.0}

@@ -9,7 +9,7 @@ import pytest
 
 from calib.gap.diagnose import Diagnosis
 from calib.gap.effects import EFFECTS
-from calib.gap.hypothesis import Hypothesis
+from calib.gap.hypotheses import Hypothesis
 from calib.report.gap_facts import NEITHER
 from calib.report.gap_verdict import over_runs
 from tests.gap.cases import diagnosis_of, pull_diagnosis

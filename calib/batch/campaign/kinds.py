@@ -42,7 +42,7 @@ from calib.gap.batch import written
 from calib.gap.case import Case, case_files, read_case
 from calib.gap.diagnose import Diagnosis, diagnose
 from calib.gap.effects import EFFECTS, Effect
-from calib.gap.effects.load import load_effects
+from calib.gap.effects.user import load_effects
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.emulation.prepared import emulated, emulated_for_both
 from calib.inference.estimators import estimate

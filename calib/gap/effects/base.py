@@ -310,7 +310,7 @@ class Effect:
             If its declaration does not hold together, or there is another one of its name.
         """
         from calib.gap.effects import EFFECTS
-        from calib.gap.effects.check import check_declared
+        from calib.gap.effects.user import check_declared
 
         check_declared(self)
         EFFECTS.add(self)

@@ -11,9 +11,8 @@ from matplotlib.axes import Axes
 from scipy.cluster.hierarchy import leaves_list, linkage
 from scipy.spatial.distance import squareform
 
-from calib.gap.diagnose import NAMED, Diagnosis
-from calib.gap.isolate import ALIKE, Isolability
-from calib.gap.placebo import Placebo, placebos
+from calib.gap.diagnose import NAMED, Diagnosis, Placebo, placebos
+from calib.gap.identifiability import ALIKE, Isolability
 from calib.report.figures.gap_where import conditions_plate, how_far_plate, where_plate
 from calib.report.figures.plate import Plate, draw_all, marked
 from calib.report.figures.style import (

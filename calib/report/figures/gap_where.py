@@ -15,7 +15,7 @@ from matplotlib.ticker import MaxNLocator
 
 from calib.data.quantities import role_of
 from calib.gap.diagnose import Diagnosis
-from calib.gap.where import Region, conditions_to_search
+from calib.gap.mixture import Region, conditions_to_search
 from calib.models.base import Array
 from calib.report.figures.plate import Plate
 from calib.report.figures.style import (

@@ -14,11 +14,11 @@ from markupsafe import Markup
 
 from calib.batch.pool import HERE, Pool
 from calib.gap.campaigns import OutputData
-from calib.gap.diagnose import NAMED, Diagnosis
+from calib.gap.diagnose import NAMED, Diagnosis, placebos
 from calib.gap.effects.dependence import PREFIX
 from calib.gap.fit import Fit
 from calib.gap.hypotheses import LN_PRIOR
-from calib.gap.inclusion import UNLISTED
+from calib.gap.mixture import UNLISTED, Region
 from calib.gap.odds import (
     LEFT,
     MOST_LEFT,
@@ -28,8 +28,6 @@ from calib.gap.odds import (
     left_of,
     probabilities,
 )
-from calib.gap.placebo import placebos
-from calib.gap.where import Region
 from calib.models import get_model
 from calib.report.figures.plate import Plate
 from calib.report.gap_evidence import (

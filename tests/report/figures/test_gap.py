@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from matplotlib.collections import PathCollection
 
+from calib.gap.diagnose import placebos
 from calib.gap.effects import EFFECTS
-from calib.gap.placebo import placebos
-from calib.gap.where import Region
+from calib.gap.mixture import Region
 from calib.report.figures import gap as collect
 from calib.report.figures.gap import (
     gap_plates,

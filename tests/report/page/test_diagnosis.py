@@ -20,10 +20,9 @@ from calib.data import table_from_arrays
 from calib.gap.case import Case, read_case
 from calib.gap.diagnose import diagnose, diagnose_once
 from calib.gap.effects import EFFECTS
-from calib.gap.files import document, write_diagnosis
-from calib.gap.inclusion import Included, Inclusion, inclusion_probability
-from calib.gap.next_measurement import NextMeasurement
-from calib.gap.track_record import track_record
+from calib.gap.files import document, track_record, write_diagnosis
+from calib.gap.identifiability import NextMeasurement
+from calib.gap.mixture import Included, Inclusion, inclusion_probability
 from calib.inference.priors import Prior
 from calib.report.gap_evidence import covered_text, gap_evidence
 from calib.report.gap_facts import (
@@ -854,7 +853,7 @@ def test_what_comes_and_goes_is_not_told_by_its_end(tmp_path):
     import numpy as np
 
     from calib.gap.diagnose import diagnose
-    from calib.gap.effects.load import load_effects
+    from calib.gap.effects.user import load_effects
     from calib.report.gap_sizes import size_sentences
     from tests.gap.cases import PULL_ONLY, make_case
     from tests.gap.test_load_effects import CODE, write

@@ -1,12 +1,9 @@
-"""Checks of a user's own effect: what it declares, and one evaluation on a case.
-
-A mistake that the fits would swallow (a misspelt method, a wrong shape) would otherwise read as
-"this effect is improbable".
-"""
+"""A user's own effects: loaded from a Python file, checked, and evaluated once on a case."""
 
 from __future__ import annotations
 
 import difflib
+import inspect
 import traceback
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
@@ -15,15 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from calib.batch.plugins import declared_in
+from calib.batch.plugins import declared_in, run_file
 from calib.data.quantities import QUANTITIES, role_of
 from calib.errors import CalibError, meant
 from calib.gap.campaigns import Campaigns, OutputData, campaigns
 from calib.gap.case import Case
 from calib.gap.effects import EFFECTS, Effect, Known, View
 from calib.gap.forward import Forward
-from calib.gap.hypotheses import effect_priors
-from calib.gap.hypothesis import Hypothesis
+from calib.gap.hypotheses import Hypothesis, effect_priors
 from calib.inference.random import generator
 from calib.models.base import Array, check_tuple
 
@@ -276,3 +272,41 @@ def _role_of_column(name: str) -> str:
 
 def _place(effect: Effect) -> str:
     return f"{declared_in(type(effect))}, effect {effect.name}"
+
+
+def load_effects(path: Path) -> dict[str, Effect]:
+    """Load the effects that a Python file defines.
+
+    Parameters
+    ----------
+    path : Path
+        Python file with subclasses of `calib.gap.effects.Effect`; ``NAME.toml`` beside it holds
+        the priors of the effect of that name.
+
+    Raises
+    ------
+    CalibError
+        If the file cannot be run, defines no effect, priors are missing, or an effect is not
+        what it must be.
+    """
+    path = Path(path)
+    module = run_file(path, "effects")
+    found: dict[str, Effect] = {}
+    for _, kind in inspect.getmembers(module, inspect.isclass):
+        if issubclass(kind, Effect) and kind.__module__ == module.__name__ and kind.name:
+            effect = kind()
+            check_declared(effect)
+            beside = path.with_name(f"{effect.name}.toml")
+            effect.prior_file = None if effect.priors else beside
+            if not effect.priors and not beside.is_file():
+                raise CalibError(
+                    f"the effect {effect.name} has no priors", where=str(beside),
+                    hint="write this file after the example of priors/effects/rate_effect.toml",
+                )  # fmt: skip
+            found[effect.name] = effect
+    if not found:
+        raise CalibError(
+            "the file defines no effect", where=str(path),
+            expected="a subclass of calib.gap.effects.Effect with a name",
+        )  # fmt: skip
+    return found

@@ -1,4 +1,4 @@
-"""Which hypothesis: fit them all, turn evidence into probabilities."""
+"""Rank all hypotheses: fit them, turn evidence into probabilities."""
 
 from __future__ import annotations
 
@@ -10,30 +10,66 @@ from scipy.special import logsumexp
 
 from calib.errors import CalibError, meant
 from calib.gap.campaigns import Campaigns, OutputData
-from calib.gap.context import Context
+from calib.gap.case import Context
 from calib.gap.effects import EFFECTS, Effect
-from calib.gap.effects.readings import ReadingDrift, ReadingStep
+from calib.gap.effects.dependence import ReadingDrift, ReadingStep
 from calib.gap.fit import Fit
-from calib.gap.guesses import Guesses
-from calib.gap.hypotheses import (
-    aside,
-    shifts,
-    singles,
-    split_testable,
-    wider,
-    with_own,
-)
-from calib.gap.hypothesis import Hypothesis
-from calib.gap.isolate import Isolability, isolability
+from calib.gap.hypotheses import Hypothesis, aside, shifts, singles, split_testable, wider, with_own
+from calib.gap.identifiability import Isolability, isolability
+from calib.gap.importance import PLENTY, refine
 from calib.gap.noise import Noise
 from calib.gap.odds import Odds, coarsening, gap_size, probabilities, relevance, with_prior
-from calib.gap.refine import PLENTY, refine
-from calib.gap.runs import follows_runs
-from calib.gap.sets import far_out, sets_and_unlisted
+from calib.gap.search import Guesses, far_out, sets_and_unlisted
 from calib.inference.estimators.search import check_defined
 from calib.inference.random import generator
 from calib.inference.sampling.mode import find_mode
 from calib.models.base import Array
+
+# What a line or a step has to gain (nats) for a drift or a jump of a reading to be worth a fit:
+# with less, their priors and the freedom of their sizes leave them below a few per cent beside
+# noise alone.
+_WORTH = 4.0
+
+
+def change_over_runs(residual: Array, order: Array) -> float:
+    """Most by which a straight line or one step over the runs raises the log likelihood.
+
+    The noise is what is left in either case.
+
+    Parameters
+    ----------
+    residual, order : ndarray, shape (n,)
+    """
+    z = residual[np.argsort(order, kind="stable")]
+    n, u = z.size, np.arange(z.size) - 0.5 * (z.size - 1)
+    z = z - z.mean()
+    before = np.arange(1, n)
+    of_step = np.square(np.cumsum(z)[:-1]) * n / (before * (n - before))
+    of_line = np.square(u @ z) / np.square(u).sum()
+    total = float(np.square(z).sum())
+    if total <= 1e-20 * float(np.square(residual).sum()):
+        return 0.0
+    part = max(float(of_step.max()), float(of_line)) / total
+    return -0.5 * n * float(np.log(max(1.0 - part, 1e-12)))
+
+
+def follows_runs(data: Campaigns, none: Fit) -> set[str]:
+    """Roles of the outputs whose residuals without a gap change over the runs.
+
+    Parameters
+    ----------
+    none : Fit
+        Of noise alone.
+    """
+    if data.view.column("order") is None:
+        return set()
+    order = data.view.of("order")
+    return {
+        o.role
+        for o in data.outputs
+        if change_over_runs(none.field_residuals[o.name], order[o.rows]) > _WORTH
+    }
+
 
 # Internal parameters of each simulator, and its noise.
 type Lab = tuple[dict[str, Array], dict[str, Noise]]
@@ -100,6 +136,11 @@ class Ranking:
             for name, group in self.fits.items()
         }
         return probabilities({n: float(np.log(s)) for n, s in shares.items()}, self.odds)
+
+    @property
+    def in_play(self) -> dict[str, Fit]:
+        """Best fits of the hypotheses worth telling apart: at most three, none below 0.03."""
+        return {n: self.best(n) for n in self.order[:3] if self.probability[n] >= 0.03}
 
     def best(self, name: str) -> Fit:
         """The most probable fit of a hypothesis."""
