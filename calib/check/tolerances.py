@@ -27,7 +27,7 @@ import scipy
 
 from calib.inference.calibration import Calibration
 from calib.validation.comparison import Comparison
-from calib.validation.sensitivity import Sensitivity
+from calib.validation.scores import Sensitivity
 from calib.validation.validate import (
     Errors,
     Place,

@@ -174,7 +174,7 @@ def fit(
     from calib.report.numbers import format_number
     from calib.report.study_tasks import HoldOut, read_and_split
     from calib.report.verdict import keep_verdict, validated, verdict
-    from calib.validation.noise_preference import noise_preference
+    from calib.validation.comparison import noise_preference
     from calib.validation.validate import PARETO_K_MAX
 
     chosen = get_model(model)

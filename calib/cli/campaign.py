@@ -82,7 +82,7 @@ def sbc(
     from calib.cli.options import progress_bars
     from calib.models import MODELS
     from calib.report.sbc import text_table, write_sbc
-    from calib.validation.sbc.run import SETTINGS, chosen_models, run_sbc
+    from calib.validation.sbc import SETTINGS, chosen_models, run_sbc
 
     slow = [name for name in MODELS if name not in chosen_models()]
     if slow and not model:

@@ -180,8 +180,8 @@ def effects(
 
 def quantities(name: Name = None, plugins: opt.Models = None, json: Json = False) -> None:
     """List the quantities that a column may hold; of one also its units and who uses it."""
-    from calib.data.headers import parse_header
     from calib.data.quantities import QUANTITIES
+    from calib.data.table import parse_header
     from calib.report.labels import declared, quantity_facts
 
     if name is not None:

@@ -50,7 +50,7 @@ def predict(
     from calib import load_calibration
     from calib.batch.folders import check_room
     from calib.data import read_for_model
-    from calib.data.units_check import beyond_notes, check_conditions
+    from calib.data.checks import beyond_notes, check_conditions
     from calib.models.simulators.emulator import emulator_of
     from calib.report.comparison import load_stack, verdicts_of
     from calib.validation.prediction import MIN_DEFINED, predict_stacked, prediction_columns

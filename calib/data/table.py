@@ -1,185 +1,344 @@
-"""The table of measurements, and the plain numbers that a model or simulator must return.
+"""A table, and how its column names say which quantity they hold, and in which unit.
 
-Every way in goes through `real_array`: functions, programs, servers and tables of runs.
+A column name is a quantity followed by a unit (``rut_depth_mm``). Upper and lower case, spaces
+and brackets make no difference (``Rut depth [mm]``). Behind it may stand ``(checked)``: its values
+are right, however unusual.
 """
 
 from __future__ import annotations
 
+import difflib
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calib.data.headers import CHECKED, Column, columns_meant, missing_columns, parse_header
-from calib.data.quantities import QUANTITIES, convert
-from calib.errors import FAULTS, CalibError
+from calib.data.quantities import QUANTITIES, UNITS, Quantity, convert
+from calib.errors import CalibError
 
-type Array = NDArray[np.float64]
+# A column such as drawbar_pull_sd or slip_angle_deg is about a quantity without being it.
+_QUALIFIERS = frozenset({
+    "sd", "std", "stdev", "se", "sem", "cv", "var", "variance", "err", "error", "uncertainty",
+    "min", "max", "mean", "median", "count", "note", "notes", "comment", "comments", "flag",
+    "id", "raw", "source", "before", "after", "lower", "upper", "angle", "setting", "target",
+    "level", "class", "method", "sensor", "channel", "time", "date",
+})  # fmt: skip
 
-# What `float` takes beyond it ("1_000", digits of other scripts) is no number of a simulator's.
-# Fortran writes exponents with a D.
-_NUMBER = re.compile(
-    r"[-+]?(?:(?:\d+\.?\d*|\.\d+)(?:[eEdD][-+]?\d+)?|nan|inf(?:inity)?)", re.ASCII | re.IGNORECASE
-)
-_ONE = "dimensionless"
+# What tells repeats of a reading apart that stand side by side.
+_REPEAT = re.compile(r"(rep|repeat|replicate|run|test|trial|no)?\d*")
+
+# What a user puts behind a header whose values are to be believed as they are.
+CHECKED = "(checked)"
 
 
-def real_array(found: Any, unit: str = _ONE) -> Array:
-    """Return numbers in a unit, in memory of their own and in the shape in which they came.
+def _stems() -> list[tuple[str, Quantity]]:
+    """Every stem and the quantity it names, the longest first."""
+    pairs = [(stem, q) for q in QUANTITIES.values() for stem in (q.stem, *q.synonyms)]
+    return sorted(pairs, key=lambda pair: -len(pair[0]))
 
-    What carries a unit is converted from it, and what carries none is in `unit`. What is masked or
-    missing (None, NA) within an array is NaN: it has no value.
+
+@dataclass(frozen=True)
+class Column:
+    """A header that was understood: its quantity and the pint unit its values are in."""
+
+    header: str
+    quantity: Quantity
+    unit: str
+    position: int = 0
+
+    @property
+    def checked(self) -> bool:
+        """Whether the user says that its values are right, however unusual."""
+        return self.header.rstrip().lower().endswith(CHECKED)
+
+    def to_canonical(self, values: ArrayLike) -> NDArray[np.float64]:
+        """Convert values in this column's unit to the canonical unit, any shape."""
+        return convert(values, self.unit, self.quantity.unit)
+
+    def written(self, values: ArrayLike) -> NDArray[np.float64]:
+        """Convert canonical values to this column's unit, any shape."""
+        return convert(values, self.quantity.unit, self.unit)
+
+    @property
+    def unit_word(self) -> str:
+        """The unit as messages say it; empty for a plain number."""
+        return "" if self.unit == "dimensionless" else self.unit.replace("**", "")
+
+    @property
+    def expected(self) -> str:
+        """The allowed values, in this column's unit."""
+        return self.quantity.range.describe(self.quantity.unit, self.unit)
+
+
+def accepted_headers(quantity: Quantity) -> tuple[str, ...]:
+    """Return every header that names a quantity by its main stem, canonical first."""
+    names = [quantity.canonical]
+    names += [quantity.stem] if quantity.bare_unit else []
+    names += [f"{quantity.stem}_{suffix}" for suffix in quantity.units]
+    return tuple(dict.fromkeys(names))
+
+
+def _normal(header: str) -> str:
+    """Bring a header to lower case words joined by underscores, without `CHECKED`."""
+    text = header.lower().rstrip().removesuffix(CHECKED)
+    text = text.replace("%", " percent ").replace("³", "3").replace("²", "2")
+    return re.sub(r"[\s_\-/()\[\]{},.:·]+", "_", re.sub(r"\^|\*\*", "", text)).strip("_")
+
+
+def parse_header(header: str, *, where: str = "", position: int = 0) -> Column | None:
+    """Read the quantity and the unit off a column name.
+
+    Parameters
+    ----------
+    header : str
+        The column name, such as ``"Rut_Depth_cm"``.
+    where : str
+        File and line to name in errors.
+    position : int
+        Index of the column, kept in the result.
+
+    Returns
+    -------
+    Column or None
+        None for a column that names none of the quantities.
 
     Raises
     ------
     CalibError
-        If it is none of real numbers, cannot be converted, or its order is not that of the rows.
+        If a quantity is named without its unit, or with an unknown or an unfitting one.
     """
-    if found is None:
-        raise _refused("it is nothing (None)", unit)
-    # Overflow of a wider type is infinite, which is no value.
-    with np.errstate(all="ignore"):
-        return _real(found, unit)
-
-
-def number_of(text: str) -> float:
-    """Return the number that a text is, with a decimal point; a CalibError if it is none."""
-    stripped = text.strip()
-    if not _NUMBER.fullmatch(stripped):
-        raise _refused(f"the text {text!r} is no number", _ONE)
-    return float(stripped.lower().replace("d", "e") if "n" not in stripped.lower() else stripped)
-
-
-def _real(found: Any, unit: str) -> Array:
-    if type(found) is np.ndarray:
-        return _of_array(found, unit)
-    if found is None or type(found).__name__ == "NAType":
-        return np.array(np.nan)
-    if isinstance(found, str):
-        return np.array(number_of(found))
-    if type(found) in (int, float):
-        return _of_scalar(found, unit)
-    _check_order(found, unit)
-    own = _unit_of(found)
-    if own is not None:
-        return convert(_real(_without_unit(found), _ONE), own, unit)
-    mask = getattr(found, "mask", None)
-    if isinstance(mask, np.ndarray | np.bool_):
-        return np.where(mask, np.nan, _real(np.where(mask, 0, np.asarray(found)), unit))
-    if isinstance(found, Sequence) and not isinstance(found, bytes | bytearray):
-        return _of_parts(found, unit)
-    inner = _inner(found)
-    if inner is not None:
-        return _real(inner, unit)
-    if isinstance(found, bool) or not hasattr(found, "__float__"):
-        raise _refused(f"it is of the type {type(found).__name__}", unit)
-    return _of_scalar(found, unit)
-
-
-def _of_scalar(found: Any, unit: str) -> Array:
-    try:
-        return np.array(float(found))
-    except (*FAULTS, ArithmeticError) as error:
-        what = f"{type(found).__name__} is no number of double precision ({error})"
-        raise _refused(what, unit) from None
-
-
-def _of_array(found: np.ndarray[Any, Any], unit: str) -> Array:
-    match found.dtype.kind:
-        case "f" | "i" | "u":
-            return found.astype(np.float64)
-        case "c":
-            missing = np.isnan(found)
-            imaginary = np.abs(np.where(missing, 0.0, found.imag))
-            if imaginary.any():
-                raise _refused(
-                    f"it is complex, with imaginary parts up to {imaginary.max():g}", unit
-                )
-            return np.where(missing, np.nan, found.real).astype(np.float64)
-        case "O" | "U":
-            return _of_parts(found.ravel().tolist(), unit).reshape(found.shape)
-        case _:
-            raise _refused(f"it is of the type {found.dtype}", unit)
-
-
-def _of_parts(found: Sequence[Any], unit: str) -> Array:
-    if {type(part) for part in found} <= {float, int}:
-        with suppress(OverflowError):
-            return np.array(found, dtype=np.float64)
-    parts = [_real(part, unit) for part in found]
-    shapes = {part.shape for part in parts}
-    if len(shapes) > 1:
-        raise _refused("its rows differ in length", unit)
-    return np.stack(parts) if parts else np.empty(0)
-
-
-def _inner(found: Any) -> Any:
-    """Return the array that something stands for, if any."""
-    if isinstance(found, np.ndarray | np.generic | complex):
-        return np.asarray(found)
-    # Labelled arrays hold others, which may have units; a conversion would lose them.
-    held = getattr(found, "data", None) if hasattr(found, "dims") else None
-    if held is not None and type(held) is not type(found):
-        return held
-    if not hasattr(found, "__array__"):
+    name = _normal(header)
+    named = _named(name)
+    if named is None:
         return None
-    try:
-        return np.asarray(found)
-    except (*FAULTS, ArithmeticError) as error:
-        raise _refused(f"{type(found).__name__} is no array of numbers ({error})", _ONE) from None
+    quantity, suffix = named
+    unit = quantity.units.get(suffix) if suffix else quantity.bare_unit
+    if unit is not None:
+        return Column(header, quantity, unit, position)
+    if suffix and _is_about(suffix, quantity) and not _is_repeat(suffix, quantity):
+        return None
+    raise _unit_error(header, quantity, suffix, where)
 
 
-def _unit_of(found: Any) -> str | None:
-    """Return the unit that something carries, as quantities of Pint, Astropy and unyt do."""
-    attributes = getattr(found, "attrs", None)
-    noted = attributes if isinstance(attributes, Mapping) else {}
-    for name in ("units", "unit"):
-        unit = noted.get(name, getattr(found, name, None))
-        if unit is not None and not callable(unit):
-            return _ONE if str(unit) in ("", "1") else str(unit)
+def names_quantity(header: str) -> bool:
+    """Whether a column name begins with a quantity, whatever its unit."""
+    return _named(_normal(header)) is not None
+
+
+def _named(name: str) -> tuple[Quantity, str] | None:
+    """Return the quantity that a normal name begins with, and what follows."""
+    for stem, quantity in _stems():
+        if name == stem or (name.startswith(f"{stem}_") and quantity.units):
+            return quantity, name[len(stem) + 1 :]
     return None
 
 
-def _without_unit(found: Any) -> Any:
-    for name in ("magnitude", "value"):
-        inner = getattr(found, name, None)
-        if inner is not None and not callable(inner):
-            return inner
-    if isinstance(found, np.ma.MaskedArray):
-        return np.ma.array(np.asarray(found), mask=np.ma.getmaskarray(found))
-    inner = _inner(found)
-    if inner is None:
-        raise _refused(f"{type(found).__name__} has a unit, but no numbers", _ONE)
-    return inner
+def _is_repeat(suffix: str, quantity: Quantity) -> bool:
+    """Whether a suffix is a unit and the number of a repeat (``1_n``, ``n_run_2``)."""
+    words = suffix.split("_")
+    rest = "_".join(word for word in words if not _REPEAT.fullmatch(word))
+    return rest != suffix and (rest in quantity.units or not rest)
 
 
-def _check_order(found: Any, unit: str) -> None:
-    """Check that the labels of what is labelled, as in pandas, are those of the rows in order."""
-    labels, axes = getattr(found, "indexes", None), getattr(found, "axes", None)
-    if isinstance(labels, Mapping):
-        axes = list(labels.values())
-    for axis in axes if isinstance(axes, list) else []:
-        with suppress(*FAULTS):
-            if np.array_equal(np.asarray(axis), np.arange(len(axis))):
-                continue
-        raise _refused(
-            f"its rows are labelled {', '.join(map(str, list(axis)[:3]))}, not 0, 1, 2 in order",
-            unit, "return them in the order of the conditions, without labels (to_numpy)",
-        )  # fmt: skip
+def _is_about(suffix: str, quantity: Quantity) -> bool:
+    """Tell a column derived from a quantity (``kn_lower``, ``sd_kn``) from a mistaken unit."""
+    derived = any(suffix.startswith(f"{unit}_") for unit in quantity.units)
+    return derived or not _QUALIFIERS.isdisjoint(suffix.split("_"))
 
 
-def _refused(what: str, unit: str, hint: str = "") -> CalibError:
-    plain = "real numbers" if unit == _ONE else f"real numbers in {unit}"
+def _at(where: str, header: str) -> str:
+    return f"{where}, column {header!r}" if where else f"column {header!r}"
+
+
+def _unit_error(header: str, quantity: Quantity, suffix: str, where: str) -> CalibError:
+    kinds = [kind for kind, units in UNITS.items() if suffix in units]
+    if not suffix:
+        found = f"the column name {header!r} does not say the unit"
+    elif kinds:
+        found = f"{suffix!r} is a unit of {kinds[0]}, but {quantity.stem} is a {quantity.kind}"
+    else:
+        found = f"{suffix!r} is not a known unit of {quantity.stem}"
+    near = difflib.get_close_matches(suffix, quantity.units, n=1, cutoff=0.5)
+    factor = _foreign_unit(header, suffix, quantity) if suffix else 0.0
+    if factor:
+        hint = f"multiply the readings by {factor:g}, and name the column {quantity.canonical}"
+    elif near:
+        hint = f"did you mean {quantity.stem}_{near[0]}?"
+    else:
+        hint = f"rename the column, for example {quantity.canonical}, with the unit of its readings"
+    if suffix and not factor:
+        hint += "; what is in no such unit must be converted first"
     return CalibError(
-        what, expected=f"{plain}, or what has a unit of its own; NaN for no value",
-        hint=hint or f"return {plain} with a decimal point, or NaN where there is no value",
+        found,
+        where=_at(where, header),
+        expected=", ".join(accepted_headers(quantity)),
+        hint=hint,
+    )
+
+
+def _foreign_unit(header: str, suffix: str, quantity: Quantity) -> float:
+    """Return how many canonical units one of a unit is that headers do not know; 0 if it is none.
+
+    It is another unit, not a known one misspelt: renamed, the readings would be in the wrong one.
+    """
+    bracketed = re.search(r"[\[(]([^\])]+)[\])]", header)
+    # Units as pint spells them: suffixes are lower case.
+    spelt = {name: unit for units in UNITS.values() for name, unit in units.items()}
+    text = "/".join(spelt.get(word, word) for word in suffix.split("_"))
+    text = bracketed[1] if bracketed else text
+    text = text.replace("²", "2").replace("³", "3").replace("^", "")
+    try:
+        return float(convert(1.0, re.sub(r"([A-Za-z])(\d)", r"\1**\2", text), quantity.unit))
+    except (CalibError, ValueError):
+        return 0.0
+
+
+def match_headers(
+    headers: Sequence[str], *, where: str, required: Sequence[str] = ()
+) -> tuple[tuple[Column, ...], tuple[str, ...]]:
+    """Read a whole header line: columns that name a quantity, and the names of the others.
+
+    `required` has canonical names that must be among them.
+
+    Raises
+    ------
+    CalibError
+        For wrong or missing units, of all columns at once, a quantity given twice, or a required
+        one that is missing.
+    """
+    found: dict[str, Column] = {}
+    given: dict[str, list[tuple[int, str]]] = {}
+    ignored: list[str] = []
+    errors: dict[str, CalibError] = {}
+    for position, header in enumerate(headers):
+        try:
+            column = parse_header(header, position=position)
+        except CalibError as error:
+            errors[header] = error
+            quantity, suffix = _named(_normal(header)) or (None, "")
+            if quantity and _is_repeat(suffix, quantity):
+                given.setdefault(quantity.canonical, []).append((position, header))
+            continue
+        if column is None:
+            ignored.append(header)
+            continue
+        given.setdefault(column.quantity.canonical, []).append((position, header))
+        found.setdefault(column.quantity.canonical, column)
+    if any(len(columns) > 1 for columns in given.values()):
+        raise _side_by_side(given, where)
+    if errors:
+        raise _together(errors, where)
+    if missing := [name for name in required if name not in found]:
+        raise missing_columns(missing, headers, ignored, where)
+    return tuple(found.values()), tuple(ignored)
+
+
+def _side_by_side(given: Mapping[str, list[tuple[int, str]]], where: str) -> CalibError:
+    """Return the error of quantities that several columns give, (position, header) each."""
+    said, header = [], ""
+    for name, columns in given.items():
+        if len(columns) > 1:
+            *most, last = [f"{position + 1} ({column!r})" for position, column in columns]
+            header = columns[-1][1]
+            both = "both" if len(columns) == 2 else "all"
+            said.append(f"columns {', '.join(most)} and {last} {both} give {QUANTITIES[name].stem}")
+    return CalibError(
+        "; ".join(said), where=_at(where, header), expected="one column per quantity",
+        hint="of one reading in several units, delete or rename one; of repeats side by side, "
+        "write each reading in a row of its own, below one another, with the conditions of its "
+        "row copied and the number of the repeat in a column 'repeat'",
     )  # fmt: skip
+
+
+def _together(errors: Mapping[str, CalibError], where: str) -> CalibError:
+    """Return one error of all headers whose units cannot be read: they are mended at once."""
+    if len(errors) == 1:
+        return next(iter(errors.values())).within(where)
+    said = "; ".join(error.message for error in errors.values())
+    allowed = "; ".join(error.expected or "" for error in errors.values())
+    hint = "; ".join(f"{header!r}: {error.hint}" for header, error in errors.items())
+    columns = f"columns {', '.join(map(repr, errors))}"
+    return CalibError(
+        said, where=f"{where}, {columns}" if where else columns, expected=allowed, hint=hint
+    )
+
+
+def missing_columns(
+    names: Sequence[str], headers: Sequence[str], ignored: Sequence[str], where: str
+) -> CalibError:
+    """Return the error of quantities, by their canonical names, that no header names.
+
+    The ignored headers are those that name none.
+    """
+    wanted = [QUANTITIES[name] for name in dict.fromkeys(names)]
+    added = ", ".join(f"{q.canonical} ({q.description})" for q in wanted)
+    derived = "".join(
+        f"; {header!r} is read as derived from the {of[0].word}, unless it is renamed to the "
+        "quantity and its unit alone"
+        for header in ignored
+        if (of := _named(_normal(header))) and of[0] in wanted
+    )
+    return CalibError(
+        f"there is no column for {', '.join(q.stem for q in wanted)}; "
+        f"found {', '.join(map(repr, headers))}",
+        where=_at(where, names[0]) if len(wanted) == 1 else where,
+        expected="; ".join(", ".join(accepted_headers(q)) for q in wanted),
+        hint=f"{renamed(ignored, names)}add the {'column' if len(wanted) == 1 else 'columns'} "
+        f"{added}{derived}",
+    )
+
+
+def renamed(headers: Iterable[str], names: Iterable[str]) -> str:
+    """Begin a way to mend with what headers may have been meant to be; empty if nothing."""
+    guesses = "; ".join(columns_meant(headers, names, shortened=True))
+    return f"{guesses} Rename it, or " if guesses else ""
+
+
+def columns_meant(
+    headers: Iterable[str], names: Iterable[str], cutoff: float = 0.7, *, shortened: bool = False
+) -> list[str]:
+    """Ask of headers that name no quantity whether one of some was meant.
+
+    Parameters
+    ----------
+    names : iterable of str
+        Canonical names of the quantities.
+    cutoff : float
+        How like one a header must be, up to 1.
+    shortened : bool
+        Whether the last words of a name will do, as of what a file must have.
+    """
+    known = {
+        name: quantity
+        for quantity in (QUANTITIES[name] for name in names)
+        for stem in (quantity.stem, *quantity.synonyms)
+        for name in (*accepted_headers(quantity), *(f"{stem}_{unit}" for unit in quantity.units))
+    }
+    return [guess for header in headers if (guess := _guess(header, known, cutoff, shortened))]
+
+
+def _guess(header: str, known: Mapping[str, Quantity], cutoff: float, shortened: bool) -> str:
+    name = _normal(header)
+    named = _named(name)
+    if named is not None and _is_about(named[1], named[0]):
+        # Renamed, an uncertainty or a limit would be taken for the reading.
+        return ""
+    near = difflib.get_close_matches(name, known, n=1, cutoff=cutoff)
+    if shortened and not near:
+        # A unit alone ("kn") is the end of a name too, but no word of it.
+        near = [k for k, q in known.items() if k.endswith(f"_{name}") and name not in q.units][:1]
+    if not near:
+        return ""
+    quantity = known[near[0]]
+    stems = (quantity.stem, *quantity.synonyms)
+    if any(near[0] == stem or name.endswith(near[0].removeprefix(stem)) for stem in stems):
+        return f"{header!r}: did you mean {near[0]}?"
+    # The header says nothing about the unit, so neither may the suggestion.
+    return f"{header!r}: did you mean {quantity.stem}, with its unit (as {quantity.canonical})?"
 
 
 MAX_TEXT_ROWS = 10_000
@@ -387,59 +546,3 @@ def hold_out(
 def _distinct(values: NDArray[np.float64], most: int = 12) -> list[str]:
     names = list(dict.fromkeys(f"{v:.6g}" for v in np.unique(values[~np.isnan(values)])))
     return names if len(names) <= most else [*names[:most], f"and {len(names) - most} more"]
-
-
-def check_enough(table: Table, n_parameters: int, *, model: str = "the model") -> None:
-    """Check that there are more rows than parameters to estimate, those of the noise among them.
-
-    Raises
-    ------
-    CalibError
-        Naming the model, if the rows cannot show any noise about a fit.
-    """
-    if len(table) > n_parameters:
-        return
-    rows = "1 row" if len(table) == 1 else f"{len(table)} rows"
-    raise CalibError(
-        f"{rows} cannot calibrate {model}, which has {n_parameters} parameters to "
-        "estimate, those of the noise among them",
-        where=table.source,
-        expected=f"at least {n_parameters + 1} rows",
-        hint="add measurements, or choose a model with fewer parameters",
-    )
-
-
-def check_settings(table: Table, conditions: Sequence[str]) -> None:
-    """Raise a CalibError if no condition varies: the rows then repeat a single measurement.
-
-    They tell one number, and leave every parameter but one to its prior. Where only some of the
-    conditions are constant, what depends on these is the prior's, which a warning says.
-    """
-    values = {name: table[name] for name in conditions}
-    if any(np.ptp(v) > 1e-12 * np.abs(v).max() for v in values.values()):
-        return
-    at = ", ".join(
-        f"{table.header_of(name)} = {float(table.column(name).written(v[0])):g}"
-        for name, v in values.items()
-    )
-    raise CalibError(
-        f"all rows are at one setting of the conditions, {at}", where=table.source,
-        expected="at least two settings: what the model says of any other would be the prior's",
-        hint="add measurements at other values, or check that the right column was written",
-    )  # fmt: skip
-
-
-def check_varies(table: Table, column: str) -> None:
-    """Raise a CalibError if the values of a column are all equal, up to rounding."""
-    values = table[column][~np.isnan(table[column])]
-    if values.size and np.ptp(values) > 1e-12 * np.abs(values).max():
-        return
-    found = "there is no value"
-    if values.size:
-        value = table.column(column).written(values[0]) if column in QUANTITIES else values[0]
-        found = f"all {values.size} values are {value:g}"
-    raise CalibError(
-        found, where=f"{table.source}, column {table.header_of(column)!r}",
-        expected="at least two different values: a constant column tells a model nothing",
-        hint="check that the right column was written, or add measurements",
-    )  # fmt: skip

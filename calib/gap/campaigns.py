@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.data import Table
+from calib.data.checks import fits_load
 from calib.data.files import plain_number
-from calib.data.headers import accepted_headers, renamed
 from calib.data.quantities import OUTPUTS, QUANTITIES, columns_of, physical_role, role_of
-from calib.data.units_check import fits_load
+from calib.data.table import accepted_headers, renamed
 from calib.errors import CalibError
 from calib.gap.case import Case
 from calib.gap.effects import Effect, View

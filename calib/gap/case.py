@@ -15,10 +15,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from calib.data import Table, read_table
 from calib.data.files import MEND_TOML, read_text, read_toml
-from calib.data.headers import parse_header
 from calib.data.quantities import OUTPUTS, output_of
 from calib.data.reader import common_label
-from calib.data.table import MAX_TEXT_ROWS
+from calib.data.table import MAX_TEXT_ROWS, parse_header
 from calib.errors import CalibError, in_words, meant
 from calib.inference.prior_files import DeclaredPriors
 from calib.inference.priors import Prior, Priors

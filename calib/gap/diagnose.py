@@ -52,7 +52,7 @@ from calib.gap.screening import (
 )
 from calib.inference.random import generator
 from calib.models.base import Array
-from calib.validation.assumptions import Remark
+from calib.validation.residuals import Remark
 
 # A single hypothesis is named when it is at least this probable.
 NAMED = 0.5

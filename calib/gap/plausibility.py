@@ -8,9 +8,7 @@ import numpy as np
 import scipy
 
 from calib.data import Table
-from calib.data.files import plain_number
-from calib.data.quantities import OUTPUTS, QUANTITIES, Quantity, columns_of, role_of
-from calib.data.units_check import (
+from calib.data.checks import (
     column_notes,
     lines_of,
     source_of,
@@ -18,12 +16,14 @@ from calib.data.units_check import (
     unit_notes,
     usual_in,
 )
+from calib.data.files import plain_number
+from calib.data.quantities import OUTPUTS, QUANTITIES, Quantity, columns_of, role_of
 from calib.gap.campaigns import Campaigns, OutputData, identical_rows
 from calib.gap.fit import Fit
 from calib.gap.ranking import Ranking
 from calib.models import get_model
 from calib.models.base import Array
-from calib.validation.assumptions import Check, Remark, failed, unexplained, unused
+from calib.validation.residuals import Check, Remark, failed, unexplained, unused
 
 # Typical outputs of two campaigns differ by less than this, whatever acts in the field.
 _ODD_RATIO = 4.0

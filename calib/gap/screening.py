@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.data import Table
+from calib.data.checks import mixed_units
 from calib.data.files import plain_number
 from calib.data.quantities import OUTPUTS, QUANTITIES, role_of
-from calib.data.units_check import mixed_units
 from calib.errors import CalibError
 from calib.gap.campaigns import MAX_RATIO, Campaigns, OutputData, campaigns
 from calib.gap.case import Case

@@ -15,7 +15,7 @@ from calib.data import hold_out, table_from_arrays
 from calib.he2019.embedded import load_he2019
 from calib.models import get_model
 from calib.report.study_tasks import HoldOut, Task
-from calib.validation.sbc.designs import Design, ModelDesign
+from calib.validation.replicate import Design, ModelDesign
 
 _PSI = "inflation_pressure_psi"
 # Between the embedded samples: cone index (kPa) and water content (g/g).

@@ -15,7 +15,7 @@ from calib.data.registry import register
 from calib.inference.estimators import Method
 from calib.report.reference import REFERENCES
 from calib.report.sections import Section, SectionKind
-from calib.validation.sbc.designs import DESIGNS
+from calib.validation.replicate import DESIGNS
 
 _LABEL = "reconstructed"
 

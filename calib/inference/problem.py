@@ -23,10 +23,10 @@ from functools import cached_property
 import numpy as np
 
 from calib.data import Table, check_enough, check_settings, check_varies
+from calib.data.checks import check_units
 from calib.data.files import plain_number
-from calib.data.headers import accepted_headers
 from calib.data.quantities import QUANTITIES
-from calib.data.units_check import check_units
+from calib.data.table import accepted_headers
 from calib.errors import CalibError
 from calib.inference.likelihood import Squares, log_normal
 from calib.inference.noise import NORMAL, Noise, Serial, noise_of, serial_of

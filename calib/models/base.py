@@ -20,9 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.batch.foreign import call
-from calib.data.files import MEND_TOML
+from calib.data.files import MEND_TOML, real_array
 from calib.data.quantities import OUTPUTS, QUANTITIES, convert
-from calib.data.table import real_array
 from calib.errors import CalibError
 from calib.models.latex import text
 

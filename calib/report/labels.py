@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from calib.data.checks import stretches
 from calib.data.files import plain_number
-from calib.data.headers import accepted_headers, parse_header
 from calib.data.quantities import QUANTITIES, Quantity, columns_of, convert
-from calib.data.units_check import stretches
+from calib.data.table import accepted_headers, parse_header
 from calib.errors import CalibError, meant
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.forward import FORM_ERROR

@@ -32,7 +32,7 @@ from calib.report.figures.style import (
 from calib.report.labels import MINUS, aligned, short, symbol
 from calib.report.numbers import finite
 from calib.report.page.template import data_uri, template
-from calib.validation.sbc.run import LEVEL, ModelScore, Quantity, SbcScore, ecdf_band
+from calib.validation.sbc import LEVEL, ModelScore, Quantity, SbcScore, ecdf_band
 
 # Of the simultaneous band drawn in each panel.
 BAND = 0.95

@@ -29,9 +29,9 @@ from calib.models import get_model
 from calib.models.base import Array
 from calib.report.study_tasks import Task, fitted_rows
 from calib.report.verdict import Evidence, gather
-from calib.validation.noise_preference import NoisePreference, noise_preference
+from calib.validation.comparison import NoisePreference, noise_preference
 from calib.validation.prediction import predictive_draws, prior_predictive
-from calib.validation.sensitivity import Sensitivity, prior_sensitivity
+from calib.validation.scores import Sensitivity, prior_sensitivity
 from calib.validation.validate import Validation, leave_one_out, validate_held_out
 
 type Progress = Callable[[str, int, int], None]

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from calib.data import Table, hold_out, read_for_model
-from calib.data.headers import parse_header, renamed
 from calib.data.quantities import OUTPUTS
+from calib.data.table import parse_header, renamed
 from calib.errors import CalibError
 from calib.inference.prior_files import prior_file_model
 from calib.models import MODELS, get_model

@@ -15,9 +15,8 @@ from calib.models.base import Array
 from calib.report.numbers import finite
 from calib.report.study import OutputResult, Study
 from calib.report.verdict import judge_evidence
-from calib.validation.noise_preference import NoisePreference
-from calib.validation.scores import Scores
-from calib.validation.sensitivity import CONTRACTION_MIN, SENSITIVITY_MIN
+from calib.validation.comparison import NoisePreference
+from calib.validation.scores import CONTRACTION_MIN, SENSITIVITY_MIN, Scores
 
 SCHEMA = "calib/summary/1"
 

@@ -31,7 +31,7 @@ from calib.models.base import Array
 from calib.report.labels import axis_of, joined, percent, plain, short, units_of
 from calib.report.rows import Result, held_table, signs_along, x_column
 from calib.report.study_tasks import MAX_ROWS
-from calib.validation.assumptions import LEVEL, Check, Range, Remark, checks_of, failed, remarks_of
+from calib.validation.assumptions import checks_of, remarks_of
 from calib.validation.prediction import (
     binomial_p,
     coverage_probability,
@@ -39,6 +39,7 @@ from calib.validation.prediction import (
     hits,
     prior_predictive,
 )
+from calib.validation.residuals import LEVEL, Check, Range, Remark, failed
 from calib.validation.scores import MOVED, PRIOR, role, standardise
 from calib.validation.validate import Validation, leave_one_out, validate_held_out
 

@@ -7,27 +7,16 @@ chance that any of them fails. `docs/statistics/likelihood.md` lists them.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import partial
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-from calib.data import Table
+from calib.data.checks import column_notes, lines_of, source_of, spelling_notes, unit_notes, word_of
 from calib.data.files import plain_number
-from calib.data.quantities import OUTPUTS, QUANTITIES
-from calib.data.units_check import (
-    column_notes,
-    lines_of,
-    source_of,
-    spelling_notes,
-    unit_notes,
-    word_of,
-)
+from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration
 from calib.inference.diagnostics import distances
@@ -36,16 +25,11 @@ from calib.inference.estimators.search import estimate_least_squares
 from calib.inference.problem import Problem
 from calib.inference.random import generator
 from calib.models.base import Array
-from calib.validation.noise_preference import linear, outlying_notes
+from calib.validation.residuals import Check, Remark, outlying_notes, residual_checks
 from calib.validation.scores import PRIOR_SET
 
-# Chance that any test of a family fails on rows and priors that are as assumed.
-LEVEL = 0.05
 # Chance that readings agree to the last digit, from which equal rows are taken for copies.
 _COPIED = 0.01
-_FEWEST, _FEWEST_FOR_TAILS = 8, 20
-# Rows of a group whose scatter or mean is compared, at least.
-_FEWEST_IN_GROUP = 5
 # Draws that are looked at for an edge of where the model has a value, and what part beyond it is.
 _PROBES, _MANY = 100, 0.2
 # Estimates so many posterior sds off, which the likelihood finds better too, contradict the prior.
@@ -59,63 +43,6 @@ _UNIT_FIRST = (
 )
 _CONTRADICTED = "Prior contradicted"
 _MEND_PRIOR = "widen the prior (`calib priors`), or look for what is wrong with the data"
-
-
-class Range(NamedTuple):
-    """Values of a condition, canonical name and unit, ends included."""
-
-    column: str
-    low: float
-    high: float
-
-    def holds(self, conditions: Mapping[str, Array]) -> bool:
-        """Whether any row of some conditions is inside; of a condition that is not there, yes."""
-        values = conditions.get(self.column)
-        return values is None or bool(((values >= self.low) & (values <= self.high)).any())
-
-
-@dataclass(frozen=True)
-class Remark:
-    """A fact that a reader should know before believing a calibration.
-
-    Parameters
-    ----------
-    text : str
-        The fact with its numbers.
-    title : str
-        Which assumption fails, in two or three words; empty where none does.
-    shifts : bool
-        Whether the median is off with it, not only the width of the bands.
-    where : tuple of Range
-        The rows it concerns: those in any of them, all if there is none.
-    """
-
-    text: str
-    title: str = ""
-    shifts: bool = False
-    where: tuple[Range, ...] = ()
-
-    def concerns(self, conditions: Mapping[str, Array]) -> bool:
-        """Whether it concerns any row of some conditions."""
-        return not self.where or any(part.holds(conditions) for part in self.where)
-
-
-class Check(NamedTuple):
-    """The probability of so much or more were an assumption right, and what to say if it is not."""
-
-    p: float
-    remark: Remark
-
-
-def failed(tests: Sequence[Check], level: float = LEVEL) -> tuple[Remark, ...]:
-    """Return what the tests say that fail together, in their order, by Holm's (1979) procedure."""
-    ranked = sorted((t.p, i) for i, t in enumerate(tests))
-    fails: set[int] = set()
-    for rank, (p, i) in enumerate(ranked):
-        if not p < level / (len(tests) - rank):
-            break
-        fails.add(i)
-    return tuple(t.remark for i, t in enumerate(tests) if i in fails)
 
 
 def checks_of(calibration: Calibration) -> tuple[Check, ...]:
@@ -383,227 +310,6 @@ def _last_digit(problem: Problem) -> float:
             step = 10.0**-places
             return float(step / np.median(y)) if problem.bound.model.response == "log" else step
     return 0.0
-
-
-def residual_checks(problem: Problem, t: Array) -> tuple[Check, ...]:
-    """Test whether the residuals at a fit, `t` (d,), are as the likelihood has them.
-
-    Residuals are those of the model made linear at the fit, over the noise's scale there (Student's
-    as normal scores), so that the moments of linear least squares hold. Of noise that is correlated
-    along a run, what each row adds to those before it is tested, without the least squares' part.
-    """
-    residual, design, rank = linear(problem, t, np.ones(problem.response.size, dtype=bool))
-    left = residual.size - rank
-    if left < _FEWEST or not float(np.ptp(residual)) > 0.0:
-        return ()
-    natural = problem.theta(t[None])
-    raw = problem.residuals(natural)
-    score = problem.noise.normal_scores(raw, natural, problem.conditions)[0]
-    leverage = np.sum(design**2, axis=1)
-    if problem.serial is not None:
-        mean, variance = problem.serial.before(score[None], problem.noise.own("rho", natural))
-        score, leverage = ((score - mean) / np.sqrt(variance))[0], np.zeros_like(score)
-    judged = leverage < 1.0 - 1e-9
-    studentised = np.where(judged, score / np.sqrt(np.where(judged, 1.0 - leverage, 1.0)), np.nan)
-    return (
-        *unexplained(problem.table, _unused(problem), studentised),
-        *(() if problem.serial is not None else _autocorrelated(problem.table, score, design)),
-        *_uneven(problem, studentised), *_heavy_tailed(problem, studentised[judged]),
-    )  # fmt: skip
-
-
-def unexplained(
-    table: Table, columns: Mapping[str, NDArray[np.str_] | Array], residual: Array, *,
-    title: str = "A column explains the residuals",
-    hint: str = "",
-) -> Iterable[Check]:  # fmt: skip
-    """Whether residuals (n,), in noise sds, differ with a column of a table that is not used.
-
-    Numbers by Spearman's rank correlation, and groups (of a category, of a number with few values,
-    of quarters of the rows otherwise) by Kruskal and Wallis's (1952) test.
-    """
-    for header, cells in columns.items():
-        numbers = _numbers(cells)
-        there = np.isfinite(residual) & (np.isfinite(numbers) | np.isnan(numbers).all())
-        if there.sum() < _FEWEST:
-            continue
-        found = []
-        score, x = residual[there], numbers[there]
-        category = bool(np.isnan(x).all())
-        names = cells[there] if category else np.array([plain_number(v) for v in x])
-        if not category and np.unique(x).size > 1:
-            found.append(scipy.stats.spearmanr(score, x).pvalue)
-        levels, group, count = np.unique(names, return_inverse=True, return_counts=True)
-        remedy = hint or (
-            "fit each of its values by itself, or choose a model that has it as a condition"
-        )
-        if not category and count.min() < _FEWEST_IN_GROUP:
-            remedy = hint or (
-                "choose a model that has it as a condition or, if the readings drift along the "
-                'runs, write correlated_along = "run_order" (a column) in the prior file'
-            )
-            edges = np.quantile(x, [0.25, 0.5, 0.75])
-            group = np.searchsorted(edges, x)
-            named = [(x[group == i].min(), x[group == i].max()) for i in np.unique(group)]
-            levels = np.array([f"{plain_number(a)} to {plain_number(b)}" for a, b in named])
-            group = np.unique(group, return_inverse=True)[1]
-            count = np.bincount(group)
-        # A category of one row each, as a remark, is none.
-        large = np.flatnonzero(count >= (2 if category else _FEWEST_IN_GROUP))
-        parts = [score[group == i] for i in large]
-        if len(parts) > 1 and sum(map(len, parts)) >= _FEWEST:
-            found.append(scipy.stats.kruskal(*parts).pvalue)
-        if not found or len(parts) < 2:
-            continue
-        means = [float(part.mean()) for part in parts]
-        low, high = int(np.argmin(means)), int(np.argmax(means))
-        p = min(1.0, len(found) * float(min(found)))
-        said = [
-            f"{means[i]:+.1f} noise sds where it is {levels[large[i]]} ({len(parts[i])} rows)"
-            for i in (high, low)
-        ]
-        yield Check(p, Remark(
-            f"{source_of(table)}: the residuals differ with {header!r}, a column that is not used: "
-            f"on average {' and '.join(said)} (p = {plain_number(p, 2)}); {remedy}",
-            title.format(header), shifts=True,
-        ))  # fmt: skip
-
-
-def _unused(problem: Problem) -> dict[str, NDArray[np.str_] | Array]:
-    """Columns of the file that neither the model nor the noise uses, other outputs left out."""
-    table, choice = problem.table, problem.noise.choice
-    own = {*problem.conditions, *OUTPUTS.values(), problem.bound.model.output}
-    own |= {name for name in table if name in QUANTITIES
-            and QUANTITIES[name].stem in (choice.depends_on, choice.correlated_along)}  # fmt: skip
-    return unused(table, own)
-
-
-def unused(table: Table, own: Collection[str]) -> dict[str, NDArray[np.str_] | Array]:
-    """Columns of a table, by their headers, save those by whose canonical names rows are judged."""
-    known = {table.header_of(n): values for n, values in table.columns.items() if n not in own}
-    # A label's numbers are codes.
-    for name in (n for n in table if n in QUANTITIES and QUANTITIES[n].kind == "label"):
-        header = table.header_of(name)
-        if header in known and header in table.header and len(table.text) == len(table):
-            at = table.header.index(header)
-            known[header] = np.array([row[at] for row in table.text])
-    # Tables that others put together may keep the cells of the rows they came from.
-    extra = {h: np.array(cells) for h, cells in table.extra.items() if len(cells) == len(table)}
-    return {**known, **extra}
-
-
-def _numbers(cells: NDArray[np.str_] | Array) -> Array:
-    """Cells as numbers, NaN where one is empty; all NaN where any is text."""
-    if cells.dtype.kind == "f":
-        return np.asarray(cells, dtype=float)
-    try:
-        return np.array([float(c.strip().replace(",", ".") or "nan") for c in cells])
-    except ValueError:
-        return np.full(cells.size, np.nan)
-
-
-def _autocorrelated(table: Table, residual: Array, design: Array) -> Iterable[Check]:
-    """Durbin and Watson's (1951) test in the order of the file, by their beta approximation."""
-    n = residual.size
-    d = float(np.square(np.diff(residual)).sum() / np.square(residual).sum())
-    mean, variance = durbin_watson_moments(design)
-    # On (0, 4) as d is.
-    x, v = mean / 4.0, variance / 16.0
-    size = x * (1.0 - x) / v - 1.0
-    r = float(np.clip(1.0 - d / mean, 0.0, 0.99))
-    yield Check(float(scipy.stats.beta.cdf(d / 4.0, x * size, (1.0 - x) * size)), Remark(
-        f"{source_of(table)}: residuals of neighbouring rows are alike (correlation {r:.2f}), as "
-        "in rows of one continuous run, or where the curve misses a pattern; the rows are worth "
-        f"about {max(1.0, n * (1.0 - r) / (1.0 + r)):.0f} independent ones, not {n}, so that "
-        'widths are too narrow: correlated_along = "run_order" (a column) under [likelihood] in '
-        "the prior file widens them; or thin the rows, or look at the residuals",
-        "Rows depend on each other",
-    ))  # fmt: skip
-
-
-def durbin_watson_moments(design: Array) -> tuple[float, float]:
-    """Mean and variance of Durbin and Watson's statistic under independent normal noise.
-
-    Of d = e'Ae/e'e with A the second difference they are exact: E = P/(n - k) and
-    2 (Q - P E)/((n - k)(n - k + 2)), with P and Q the traces of MA and (MA)^2, and M the
-    projection on what the design leaves (doi:10.1093/biomet/38.1-2.159), whose columns, shape
-    (n, k), are orthonormal and span what was fitted.
-    """
-    n, rank = design.shape
-    left = n - rank
-    on_design = _second_difference(design)
-    gram = design.T @ on_design
-    p = 2.0 * (n - 1) - float(np.trace(gram))
-    q = 2.0 * (3 * n - 4) - 2.0 * float(np.square(on_design).sum()) + float(np.square(gram).sum())
-    mean = p / left
-    return mean, 2.0 * (q - p * mean) / (left * (left + 2.0))
-
-
-def _second_difference(x: Array) -> Array:
-    steps = np.diff(x, axis=0)
-    out = np.zeros_like(x)
-    out[:-1] -= steps
-    out[1:] += steps
-    return out
-
-
-def _uneven(problem: Problem, residual: Array) -> Iterable[Check]:
-    """Whether the scatter of residuals (n,) differs with a condition.
-
-    By Levene's test, in Brown and Forsythe's form, where every value has its group of rows;
-    otherwise by Kendall's rank correlation with their sizes, which is exact for few rows.
-    """
-    there = np.isfinite(residual)
-    for name, every in problem.conditions.items():
-        score, values = residual[there], every[there]
-        levels, group, count = np.unique(values, return_inverse=True, return_counts=True)
-        if levels.size < 2 or name == problem.noise.column:
-            continue
-        word, stem = word_of(problem.table, QUANTITIES[name]), QUANTITIES[name].stem
-        remedy = f'noise_depends_on = "{stem}" in the prior file lets it change'
-        remark = partial(Remark, title="Scatter is uneven")
-        if count.min() >= _FEWEST_IN_GROUP:
-            parts = [score[group == i] for i in range(levels.size)]
-            sd = np.array([part.std(ddof=1) for part in parts])
-            wide, tight = int(np.argmax(sd)), int(np.argmin(sd))
-            column, p = problem.table.column(name), float(scipy.stats.levene(*parts).pvalue)
-            at = [
-                f"{plain_number(float(column.written(levels[i])), 4)} {column.unit_word}".rstrip()
-                for i in (wide, tight)
-            ]
-            yield Check(p, remark(
-                f"{source_of(problem.table)}: the scatter differs with {word}: one sigma is too "
-                f"narrow at {at[0]}, where the residuals have an sd of {sd[wide]:.2f} sigma, and "
-                f"too wide at {at[1]} ({sd[tight]:.2f} sigma; p = {plain_number(p, 2)}): {remedy}",
-                where=tuple(_nearest(name, levels, i) for i in (wide, tight)),
-            ))  # fmt: skip
-            continue
-        found = scipy.stats.kendalltau(np.abs(score), values)
-        grows = "grows" if found.statistic > 0.0 else "falls"
-        yield Check(float(found.pvalue), remark(
-            f"{source_of(problem.table)}: the scatter {grows} with {word} (rank correlation "
-            f"{found.statistic:.2f}); one sigma is too wide at one end and too narrow at the "
-            f"other: {remedy}",
-        ))  # fmt: skip
-
-
-def _nearest(name: str, levels: Array, i: int) -> Range:
-    """Values of a condition that are nearer to one of its levels, in order, than to others."""
-    edges = [-np.inf, *(0.5 * (levels[1:] + levels[:-1])), np.inf]
-    return Range(name, float(edges[i]), float(edges[i + 1]))
-
-
-def _heavy_tailed(problem: Problem, residual: Array) -> Iterable[Check]:
-    """Anscombe and Glynn's (1983) test of the kurtosis, one-sided."""
-    if residual.size < _FEWEST_FOR_TAILS or problem.noise.student:
-        return
-    p = float(scipy.stats.kurtosistest(residual, alternative="greater").pvalue)
-    yield Check(p, Remark(
-        f"{source_of(problem.table)}: the residuals have heavier tails than normal noise "
-        f"(excess kurtosis {scipy.stats.kurtosis(residual):.1f}); single readings then weigh "
-        'too much: correct those that are wrong, or write family = "student_t" in the prior file',
-        "Heavy tails",
-    ))  # fmt: skip
 
 
 def _rows(n: int) -> str:

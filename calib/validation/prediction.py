@@ -18,8 +18,8 @@ from scipy.special import bdtr, ndtri
 
 from calib.batch.threads import one_thread
 from calib.data import Table
-from calib.data.headers import parse_header
-from calib.data.units_check import stretches
+from calib.data.checks import stretches
+from calib.data.table import parse_header
 from calib.errors import CalibError
 from calib.inference.random import generator
 from calib.models.base import Array

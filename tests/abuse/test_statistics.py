@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from calib.cli.verbs import app
 from calib.data import read_for_model, table_from_arrays
-from calib.data.units_check import beyond_notes, column_notes
+from calib.data.checks import beyond_notes, column_notes
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import estimate

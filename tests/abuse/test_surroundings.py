@@ -158,7 +158,7 @@ def fail(*_: object, **__: object) -> Any:
 @pytest.mark.parametrize(
     ("words", "stage", "kept"),
     [
-        (FIT, "calib.validation.noise_preference.noise_preference", "run-unfinished/run"),
+        (FIT, "calib.validation.comparison.noise_preference", "run-unfinished/run"),
         (FIT, "calib.inference.io.write_table", ""),
         (
             ["report", "ruts.csv", "--model", "bekker", "--max-steps", "400", "--workers", "1",

@@ -255,7 +255,7 @@ def test_a_second_process_that_lands_results_is_refused(
     verb: str, inside: str, no_work: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # That the folder is not empty is another reason, told first.
-    monkeypatch.setattr("calib.validation.sbc.run._claim", lambda *_: None)
+    monkeypatch.setattr("calib.validation.sbc._claim", lambda *_: None)
     monkeypatch.setattr("calib.batch.campaign.run.check_folder", lambda *_: None)
     with another("alone", Path(inside)):
         said = refused(LANDING[verb], Path("out"))

@@ -28,7 +28,7 @@ from calib.report.sections import work_out
 from calib.report.study_tasks import Task
 from calib.report.summary import summarise
 from calib.report.writer import file_hashes, write_report
-from calib.validation.sbc.run import run_sbc
+from calib.validation.sbc import run_sbc
 
 SHORT = SamplerSettings(steps=60, max_steps=60)
 LONGER = SamplerSettings(steps=100, max_steps=400)

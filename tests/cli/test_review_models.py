@@ -12,7 +12,7 @@ import pytest
 from calib.errors import CalibError
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import MODELS, example_csv
-from calib.validation.sbc.replicate import Item, replicate
+from calib.validation.replicate import Item, replicate
 from tests.cli.test_cli import Calib
 from tests.cli.test_cli import calib as calib
 
@@ -114,7 +114,7 @@ def test_slow_models_are_left_out_of_sbc_unless_named(
     calib: Calib, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from calib.batch.campaign.kinds import SbcSection
-    from calib.validation.sbc.run import chosen_models
+    from calib.validation.sbc import chosen_models
 
     assert [m for m in MODELS if MODELS[m].slow] == SLOW
     assert set(chosen_models()) == set(MODELS) - set(SLOW)
@@ -124,7 +124,7 @@ def test_slow_models_are_left_out_of_sbc_unless_named(
     def stop(*_: object, **__: object) -> None:
         raise CalibError("begun")
 
-    monkeypatch.setattr("calib.validation.sbc.run.run_sbc", stop)
+    monkeypatch.setattr("calib.validation.sbc_sbc", stop)
     told = calib("sbc", "--out", "sbc").err
     assert "begun" in told
     assert f"left out: {', '.join(SLOW)}, of which each campaign takes minutes" in told

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from calib.data.headers import accepted_headers, columns_meant, match_headers, parse_header
 from calib.data.quantities import QUANTITIES, UNITS, Quantity, Range
 from calib.data.reader import table_from_arrays
+from calib.data.table import accepted_headers, columns_meant, match_headers, parse_header
 from calib.errors import CalibError
 from calib.models import MODELS
 

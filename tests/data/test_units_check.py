@@ -8,13 +8,7 @@ import numpy as np
 import pytest
 
 from calib.data import read_for_model, read_table, table_from_arrays, write_table
-from calib.data.units_check import (
-    beyond_notes,
-    check_conditions,
-    check_units,
-    column_notes,
-    unit_notes,
-)
+from calib.data.checks import beyond_notes, check_conditions, check_units, column_notes, unit_notes
 from calib.errors import CalibError
 from calib.models import MODELS, example_csv
 

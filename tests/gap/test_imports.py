@@ -30,7 +30,7 @@ def test_to_look_at_the_units_of_data_needs_no_package_of_units():
         "from calib import build_problem, load_he2019\n"
         "build_problem('magic_formula_pressure', load_he2019('drawbar_pull'))"
     )
-    assert "calib.data.units_check" in found
+    assert "calib.data.checks" in found
     assert "pint" not in found
 
 

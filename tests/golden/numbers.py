@@ -23,8 +23,8 @@ import calib
 from calib.batch.plugins import run_file
 from calib.models import MODELS, example_csv
 from calib.models.simulators.registered import SIMULATED
-from calib.validation.sbc.replicate import Item, replicate
-from calib.validation.sbc.run import SETTINGS
+from calib.validation.replicate import Item, replicate
+from calib.validation.sbc import SETTINGS
 from challenge.make import make
 from challenge.measured.cases import HERE as MEASURED
 from challenge.measured.cases import read_cases

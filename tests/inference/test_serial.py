@@ -16,9 +16,8 @@ from calib.inference.estimators import estimate
 from calib.inference.io import load_calibration, save_calibration
 from calib.inference.noise import serial_of
 from calib.inference.problem import Problem, build_problem
-from calib.validation.noise_preference import noise_words
-from calib.validation.sbc.designs import design_of
-from calib.validation.sbc.simulate import simulate
+from calib.validation.comparison import noise_words
+from calib.validation.replicate import design_of, simulate
 from tests.conftest import SEED
 from tests.inference.test_noise import STUDENT, WORDS, drawn, prior_text
 

@@ -21,8 +21,8 @@ from calib.report.verdict import (
     judge_evidence,
     validated,
 )
-from calib.validation.assumptions import LEVEL, Check, Range, Remark
 from calib.validation.prediction import binomial_p
+from calib.validation.residuals import LEVEL, Check, Range, Remark
 
 FINE = Evidence(
     converged=True,

@@ -17,19 +17,16 @@ from calib.inference.problem import Problem, build_problem
 from calib.inference.sampling.mode import find_mode
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import MODELS, example_csv
-from calib.validation.assumptions import (
+from calib.validation.assumptions import _cut_off, checks_of, file_remarks, remarks_of
+from calib.validation.residuals import (
     LEVEL,
     Check,
     Remark,
-    _cut_off,
-    checks_of,
     durbin_watson_moments,
     failed,
-    file_remarks,
-    remarks_of,
+    linear,
     residual_checks,
 )
-from calib.validation.noise_preference import linear
 from tests.custom_problems import normal, problem_of
 from tests.validation.test_outliers import fitted_line, line_problem
 

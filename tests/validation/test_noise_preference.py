@@ -11,7 +11,7 @@ from calib.inference.calibration import Calibration, calibrate
 from calib.inference.noise import Noise, NoiseChoice
 from calib.inference.priors import Priors
 from calib.inference.problem import Problem
-from calib.validation.noise_preference import NoisePreference, noise_preference, with_usual_noise
+from calib.validation.comparison import NoisePreference, noise_preference, with_usual_noise
 from calib.validation.validate import leave_one_out
 from tests.custom_problems import normal, problem_of
 

@@ -12,7 +12,7 @@ from calib.data.quantities import OUTPUTS
 from calib.he2019.designs import he2019_tasks
 from calib.inference.problem import Problem, build_problem
 from calib.inference.sampling.mode import find_mode
-from calib.validation.noise_preference import LEVEL, linear, outlying_notes, outlying_rows
+from calib.validation.residuals import OUTLYING_LEVEL, linear, outlying_notes, outlying_rows
 from tests.custom_problems import normal, problem_of
 
 TASKS = {task.output: task for task in he2019_tasks()}
@@ -94,7 +94,7 @@ def test_data_as_the_likelihood_says_are_left_alone() -> None:
         slip = rng.random(12)
         pull = slip + rng.standard_normal(12)
         named += bool(outlying_rows(line_problem(slip, pull), fitted_line(slip, pull)))
-    assert stats.binom.sf(named - 1, 200, LEVEL) > 1e-3
+    assert stats.binom.sf(named - 1, 200, OUTLYING_LEVEL) > 1e-3
 
 
 @pytest.mark.parametrize("output", ["bulk_density", "drawbar_pull", "rut_depth"])

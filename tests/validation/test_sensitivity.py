@@ -8,12 +8,7 @@ from scipy import stats
 
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.io import to_datatree
-from calib.validation.sensitivity import (
-    CONTRACTION_MIN,
-    SENSITIVITY_MIN,
-    Sensitivity,
-    prior_sensitivity,
-)
+from calib.validation.scores import CONTRACTION_MIN, SENSITIVITY_MIN, Sensitivity, prior_sensitivity
 from tests.custom_problems import fixed, normal, problem_of
 
 SLIP = np.linspace(0.0, 0.3, 10)

@@ -14,15 +14,9 @@ from calib.inference.estimators.search import estimate_least_squares
 from calib.inference.priors import Prior
 from calib.inference.problem import Problem
 from calib.report.verdict import verdict
-from calib.validation.assumptions import (
-    LEVEL,
-    checks_of,
-    failed,
-    parameter_remarks,
-    remarks_of,
-    residual_checks,
-)
+from calib.validation.assumptions import checks_of, parameter_remarks, remarks_of
 from calib.validation.prediction import predict
+from calib.validation.residuals import LEVEL, failed, residual_checks
 from calib.validation.validate import leave_one_out
 from tests.custom_problems import normal, problem_of
 from tests.validation.test_outliers import fitted_line, line_problem

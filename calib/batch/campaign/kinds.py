@@ -57,8 +57,8 @@ from calib.models.simulators.registered import slow_simulator
 from calib.report.page.diagnosis import write_page
 from calib.report.study_tasks import HoldOut, read_and_split
 from calib.report.verdict import Verdict, keep_verdict, verdict
-from calib.validation.sbc.replicate import Item, replicate
-from calib.validation.sbc.run import SETTINGS, chosen_models
+from calib.validation.replicate import Item, replicate
+from calib.validation.sbc import SETTINGS, chosen_models
 from calib.validation.validate import validate_held_out
 
 # What is run of a slow simulator does not depend on a task's own stream: it is what

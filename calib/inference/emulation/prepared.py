@@ -16,9 +16,9 @@ import numpy as np
 
 from calib.batch.plugins import load_files
 from calib.data import Table
-from calib.data.files import open_csv
-from calib.data.headers import parse_header
-from calib.data.table import real_array
+from calib.data.files import real_array
+from calib.data.reader import open_csv
+from calib.data.table import parse_header
 from calib.errors import CalibError
 from calib.inference.emulation.judge import judged, left_out
 from calib.inference.emulation.sequential import emulate, extend

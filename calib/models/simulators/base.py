@@ -14,9 +14,9 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from calib.data.headers import parse_header
+from calib.data.files import real_array
 from calib.data.quantities import QUANTITIES, convert
-from calib.data.table import real_array
+from calib.data.table import parse_header
 from calib.errors import CalibError
 from calib.models.base import Array
 

@@ -131,7 +131,7 @@ def _explain(error: ValidationError, path: Path) -> CalibError:
 
 def _ranges(file: SimulatorFile, path: Path) -> dict[str, tuple[float, float]]:
     """Ranges by canonical condition; they are given by the simulator's own names, in its units."""
-    from calib.data.headers import parse_header
+    from calib.data.table import parse_header
 
     found = {}
     for name, (low, high) in file.ranges.items():

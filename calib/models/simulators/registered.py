@@ -16,8 +16,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from calib.data.files import MEND_TOML
-from calib.data.headers import parse_header
 from calib.data.registry import Registry, run_again
+from calib.data.table import parse_header
 from calib.errors import CalibError, in_words
 from calib.models import MODELS
 from calib.models.base import (

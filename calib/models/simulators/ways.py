@@ -29,8 +29,7 @@ import numpy as np
 from calib.batch.foreign import call
 from calib.batch.plugins import declared_in
 from calib.batch.sources import content_of, fingerprint
-from calib.data.files import read_text
-from calib.data.table import real_array
+from calib.data.files import read_text, real_array
 from calib.errors import CalibError
 from calib.models.base import Array
 from calib.models.simulators.base import Failure, Given, Printed, no_output, not_made, tail

@@ -23,8 +23,7 @@ from calib.report.page.template import symbol_html, unit_html
 from calib.report.reference import NOTHING as NONE
 from calib.report.reference import Figure, FittedTable, Reference
 from calib.report.study import OutputResult
-from calib.validation.scores import role
-from calib.validation.sensitivity import CONTRACTION_MIN, SENSITIVITY_MIN
+from calib.validation.scores import CONTRACTION_MIN, SENSITIVITY_MIN, role
 
 _TICK = "\N{CHECK MARK}"
 _MINUS = "\N{MINUS SIGN}"

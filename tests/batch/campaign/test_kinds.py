@@ -30,7 +30,7 @@ from calib.models import MODELS, example_csv, get_model
 from calib.models.simulators.emulator import emulator_of, load_emulator
 from calib.models.simulators.files import register_file
 from calib.models.simulators.registered import SIMULATED
-from calib.validation.sbc.run import run_sbc
+from calib.validation.sbc import run_sbc
 from calib.validation.validate import validate_held_out
 from challenge.make import make
 from tests.batch.campaign.sites import EFFECT, NAMES, WIND, content, refuse_all

@@ -15,8 +15,8 @@ from scipy import stats
 from calib.inference.problem import Problem, build_problem
 from calib.inference.sampling.sampler import sample_posterior
 from calib.models import MODELS
-from calib.validation.sbc.designs import design_of
-from calib.validation.sbc.run import holm
+from calib.validation.replicate import design_of
+from calib.validation.sbc import holm
 
 RUNS, LIVE = 10, 150
 QUANTILES = (0.05, 0.5, 0.95)

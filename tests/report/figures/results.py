@@ -15,7 +15,7 @@ from calib.models.base import Array
 from calib.report.study import OutputResult
 from calib.report.study_tasks import HoldOut, Task
 from calib.validation.prediction import predictive_draws
-from calib.validation.sensitivity import prior_sensitivity
+from calib.validation.scores import prior_sensitivity
 from calib.validation.validate import leave_one_out, validate_held_out
 
 HELD = HoldOut("inflation_pressure_psi", 30.0)

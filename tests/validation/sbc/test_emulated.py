@@ -11,7 +11,7 @@ import pytest
 
 import calib
 from calib.errors import CalibError
-from calib.validation.sbc.run import run_sbc
+from calib.validation.sbc import run_sbc
 from tests.inference.emulation.test_emulate import as_before as as_before
 from tests.models.simulators.examples import PRIORS, lab, pull
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.validation.sbc.run import holm, p_value, pit
+from calib.validation.sbc import holm, p_value, pit
 
 SIMULATIONS, DRAWS, ROWS, EXPERIMENTS = 300, 400, 5, 10
 

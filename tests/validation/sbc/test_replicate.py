@@ -12,9 +12,8 @@ import pytest
 from calib.inference.calibration import Calibration
 from calib.inference.prior_files import DeclaredPriors, default_priors
 from calib.models import MODELS
-from calib.validation.sbc.designs import design_of
-from calib.validation.sbc.replicate import Item, calibrated, measure, replicate, simulated
-from calib.validation.sbc.run import SETTINGS, score, score_model
+from calib.validation.replicate import Item, calibrated, design_of, measure, replicate, simulated
+from calib.validation.sbc import SETTINGS, score, score_model
 
 # One chance in ten thousand of a false alarm in all quantities together.
 RARE = 1e-4

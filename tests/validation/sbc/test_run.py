@@ -15,7 +15,7 @@ from calib.inference.diagnostics import Gate
 from calib.inference.prior_files import default_priors
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.sbc import text_table, verdict
-from calib.validation.sbc.run import run_sbc
+from calib.validation.sbc import run_sbc
 from tests.browser import Browser, faults
 
 MODELS = ("bekker", "modified_bekker")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calib.errors import CalibError
-from calib.validation.sbc.run import _coverage, score
+from calib.validation.sbc import _coverage, score
 
 
 def records(covered: np.ndarray, rows: int) -> list[dict]:

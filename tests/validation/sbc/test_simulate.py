@@ -9,8 +9,7 @@ from scipy import stats
 from calib.data import table_from_arrays
 from calib.inference.problem import build_problem
 from calib.models import MODELS
-from calib.validation.sbc.designs import design_of
-from calib.validation.sbc.simulate import simulate
+from calib.validation.replicate import design_of, simulate
 
 
 @pytest.mark.parametrize("model", MODELS)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from calib.validation.sbc.run import ecdf_band, holm, p_value, pit
+from calib.validation.sbc import ecdf_band, holm, p_value, pit
 
 
 def statistic(values: np.ndarray) -> float:

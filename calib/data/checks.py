@@ -1,12 +1,12 @@
 """Values that are unusual or as in another unit than their column says; columns misspelt.
 
 A whole column that is as in another unit is refused where a model is to be fitted to it, and only
-warned of elsewhere; the user can say that it is right (`calib.data.headers.CHECKED`).
+warned of elsewhere; the user can say that it is right (`calib.data.table.CHECKED`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePath
 
@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.data.files import plain_number
-from calib.data.headers import CHECKED, accepted_headers, columns_meant
 from calib.data.quantities import QUANTITIES, Quantity, columns_of, convert
-from calib.data.table import Table
+from calib.data.table import CHECKED, Table, accepted_headers, columns_meant
 from calib.errors import CalibError
 
 type Array = NDArray[np.float64]
@@ -333,3 +332,59 @@ def lines_of(table: Table, rows: NDArray[np.bool_]) -> str:
     named = ", ".join(map(str, lines[:_MOST_NAMED]))
     more = f" and {len(lines) - _MOST_NAMED} more" if len(lines) > _MOST_NAMED else ""
     return f"{'line' if len(lines) == 1 else 'lines'} {named}{more}"
+
+
+def check_enough(table: Table, n_parameters: int, *, model: str = "the model") -> None:
+    """Check that there are more rows than parameters to estimate, those of the noise among them.
+
+    Raises
+    ------
+    CalibError
+        Naming the model, if the rows cannot show any noise about a fit.
+    """
+    if len(table) > n_parameters:
+        return
+    rows = "1 row" if len(table) == 1 else f"{len(table)} rows"
+    raise CalibError(
+        f"{rows} cannot calibrate {model}, which has {n_parameters} parameters to "
+        "estimate, those of the noise among them",
+        where=table.source,
+        expected=f"at least {n_parameters + 1} rows",
+        hint="add measurements, or choose a model with fewer parameters",
+    )
+
+
+def check_settings(table: Table, conditions: Sequence[str]) -> None:
+    """Raise a CalibError if no condition varies: the rows then repeat a single measurement.
+
+    They tell one number, and leave every parameter but one to its prior. Where only some of the
+    conditions are constant, what depends on these is the prior's, which a warning says.
+    """
+    values = {name: table[name] for name in conditions}
+    if any(np.ptp(v) > 1e-12 * np.abs(v).max() for v in values.values()):
+        return
+    at = ", ".join(
+        f"{table.header_of(name)} = {float(table.column(name).written(v[0])):g}"
+        for name, v in values.items()
+    )
+    raise CalibError(
+        f"all rows are at one setting of the conditions, {at}", where=table.source,
+        expected="at least two settings: what the model says of any other would be the prior's",
+        hint="add measurements at other values, or check that the right column was written",
+    )  # fmt: skip
+
+
+def check_varies(table: Table, column: str) -> None:
+    """Raise a CalibError if the values of a column are all equal, up to rounding."""
+    values = table[column][~np.isnan(table[column])]
+    if values.size and np.ptp(values) > 1e-12 * np.abs(values).max():
+        return
+    found = "there is no value"
+    if values.size:
+        value = table.column(column).written(values[0]) if column in QUANTITIES else values[0]
+        found = f"all {values.size} values are {value:g}"
+    raise CalibError(
+        found, where=f"{table.source}, column {table.header_of(column)!r}",
+        expected="at least two different values: a constant column tells a model nothing",
+        hint="check that the right column was written, or add measurements",
+    )  # fmt: skip

@@ -9,13 +9,16 @@ A replicate is a pure function of its item, so it can run anywhere and in any or
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
-from calib.data import table_from_arrays
+from calib.data import Table, read_for_model, table_from_arrays
+from calib.data.registry import Registry
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.emulation import Emulation
@@ -26,14 +29,179 @@ from calib.inference.prior_files import PriorFile
 from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
 from calib.inference.sampling.sampler import Draws, SamplerSettings
+from calib.models import Model, example_csv, get_model
 from calib.models.base import Array, Conditions, not_given
 from calib.models.simulators.registered import Simulated as SlowSimulator
 from calib.models.simulators.registered import slow_simulator
 from calib.models.simulators.runs import RunKeeper
 from calib.validation.prediction import predict
-from calib.validation.sbc.designs import Design, design_of
-from calib.validation.sbc.simulate import Simulated, simulate
 from calib.validation.scores import LEVELS
+
+
+@dataclass(frozen=True)
+class Design:
+    """Where a model is measured.
+
+    Parameters
+    ----------
+    table : Table
+        The rows to calibrate on; their outputs are placeholders for simulated ones.
+    held : mapping of str to ndarray, shape (m,)
+        Conditions of the rows that are held out.
+    text : str
+        Both in words.
+    """
+
+    model: str
+    table: Table
+    held: dict[str, Array]
+    text: str
+
+    @property
+    def watched(self) -> int:
+        """The held-out row at which a single prediction is followed."""
+        return len(next(iter(self.held.values()))) // 2
+
+
+@dataclass(frozen=True)
+class ModelDesign:
+    """Where a model is measured, unless at the conditions of its own example.
+
+    Parameters
+    ----------
+    make : callable
+        ``() -> Design``.
+    """
+
+    model: str
+    make: Callable[[], Design]
+
+    def register(self) -> None:
+        """Have the model simulated there."""
+        DESIGNS.add(self)
+
+
+DESIGNS: Registry[ModelDesign] = Registry("design", lambda design: design.model)
+
+
+def design_of(model_name: str, data: Path | None = None) -> Design:
+    """Return the design of a model, or that of a campaign's CSV if one is given.
+
+    Raises
+    ------
+    CalibError
+        If it has neither a design nor an example, or the file cannot be read.
+    """
+    model = get_model(model_name)
+    known = DESIGNS.get(model.name)
+    if data is not None:
+        design = _of_file(model, data, str(data))
+    else:
+        design = known.make() if known is not None else _of_example(model)
+    # For noise that is correlated along a run, if the priors ask for it.
+    order = {"run_order": np.arange(1.0, len(design.table) + 1.0)}
+    return replace(design, table=replace(design.table, columns=order | dict(design.table.columns)))
+
+
+def _of_example(model: Model) -> Design:
+    """The conditions of a model's own example."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / f"{model.name}.csv"
+        path.write_text(example_csv(model.name), encoding="utf-8")
+        return _of_file(model, path, "the model's example")
+
+
+def _of_file(model: Model, path: Path, where: str) -> Design:
+    table = read_for_model(path, (*model.conditions, model.output))
+    held = {name: 0.5 * (v[1:] + v[:-1]) for name, v in model.select(table.columns).items()}
+    n = len(table)
+    text = f"{n} conditions of {where}; held out: {n - 1} midway between them"
+    return Design(model.name, table, held, text)
+
+
+_MOST_ATTEMPTS = 10_000
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """A campaign whose truth is known.
+
+    Parameters
+    ----------
+    truth : ndarray, shape (d,)
+        Internal coordinates.
+    problem : Problem
+        Of the simulated calibration data.
+    held : mapping of str to ndarray, shape (m,)
+        Conditions of the held-out rows.
+    location, measured : ndarray, shape (m,)
+        At the held-out rows: the model's output at the truth, and a measurement of it; NaN where
+        the model has no value.
+    attempts : int
+        Draws from the prior until the model had a value at every row.
+    """
+
+    truth: Array
+    problem: Problem
+    held: dict[str, Array]
+    location: Array
+    measured: Array
+    attempts: int
+
+
+def simulate(
+    template: Problem, design: Design, rng: np.random.Generator, attempts: int = _MOST_ATTEMPTS
+) -> Simulated:
+    """Simulate a campaign at the design's conditions.
+
+    Parameters for which the equation has no value at some row have no likelihood: the posterior
+    excludes them, so the prior that the truths come from does too. Data that a float cannot hold
+    are drawn again with new parameters; a choice made by looking at data alone keeps ranks uniform
+    (Modrak et al. 2023, doi:10.1214/23-BA1404).
+
+    Raises
+    ------
+    CalibError
+        If the model has no value at the design, however often the prior is asked.
+    """
+    bound = template.bound
+    for attempt in range(1, attempts + 1):
+        truth = template.priors.sample(rng, 1)
+        natural = template.theta(truth)
+        noisy = _noisy(template, natural, template.conditions, template.draw_noise(natural, rng))[1]
+        apart = template.noise.draw(natural, design.held, rng, _count(design.held))
+        location, measured = _noisy(template, natural, design.held, apart)
+        if np.isfinite(noisy).all() and (bound.model.response != "log" or (noisy > 0.0).all()):
+            return Simulated(
+                truth[0], template.with_table(_measured(template, noisy)), design.held, location,
+                measured, attempt,
+            )  # fmt: skip
+    raise CalibError(
+        f"the prior of {bound.model.name} gave no data in {attempts} draws",
+        where=template.priors.source,
+        hint="look for conditions at which the model has no value",
+    )
+
+
+def _noisy(
+    problem: Problem, natural: Array, conditions: Mapping[str, Array], noise: Array
+) -> tuple[Array, Array]:
+    """Output at some conditions and a measurement of it, each of shape (n,)."""
+    location = problem.bound.mean_response(problem.of_model(natural), conditions)[0]
+    with np.errstate(over="ignore"):
+        back = problem.bound.from_response
+        return back(location), back(location + noise[0])
+
+
+def _count(conditions: Mapping[str, Array]) -> int:
+    return next(iter(conditions.values())).size
+
+
+def _measured(template: Problem, output: Array) -> Table:
+    # Not checked as a file is: a prior may expect values that no instrument reads.
+    columns = {**template.table.columns, template.bound.model.output: output}
+    return replace(template.table, columns=columns, source="simulated", label="simulated", text=())
+
 
 # Of which at least half has to have a value, or the emulation refuses.
 MOST_TRUTHS = 50

@@ -1,4 +1,8 @@
-"""Run the replicates of all models, and test whether ranks are uniform and bands cover.
+"""Simulation-based calibration: whether posteriors and bands are right where the truth is known.
+
+Parameters are drawn from the prior, data from the parameters, and the posterior of those data is
+sampled exactly as a user's would be. If prior, likelihood and sampler agree, the rank of the truth
+among posterior draws is uniform for every quantity [3]_ [4]_.
 
 The statistic is the smallest pointwise binomial tail of the ECDF over its evaluation points
 (Saeilynoja, Buerkner & Vehtari 2022). Bands come from ArviZ, which simulates the statistic; the
@@ -8,6 +12,9 @@ References
 ----------
 .. [1] Saeilynoja, Buerkner & Vehtari (2022), doi:10.1007/s11222-022-10090-6.
 .. [2] Moscovich & Nadler (2017), doi:10.1016/j.spl.2016.11.027: the Poisson recursion.
+.. [3] Talts, Betancourt, Simpson, Vehtari & Gelman (2018), arXiv:1804.06788.
+.. [4] Modrak, Moon, Kim, Buerkner, Huurre, Faltejskova, Gelman & Vehtari (2023),
+   doi:10.1214/23-BA1404.
 """
 
 from __future__ import annotations
@@ -33,8 +40,7 @@ from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import MODELS, get_model
 from calib.models.base import Array
 from calib.models.simulators.registered import slow_simulator
-from calib.validation.sbc.designs import design_of
-from calib.validation.sbc.replicate import Item, most_runs, replicate
+from calib.validation.replicate import Item, design_of, most_runs, replicate
 from calib.validation.scores import LEVELS
 
 _SIMULATIONS = 4000
@@ -219,7 +225,7 @@ def score(
     records: Sequence[Mapping[str, Any]], seed: int, simulations: int,
     failed: Mapping[str, str] | None = None,
 ) -> SbcScore:  # fmt: skip
-    """Score the records of a run, as `calib.validation.sbc.replicate.replicate` returns them.
+    """Score the records of a run, as `calib.validation.replicate.replicate` returns them.
 
     Errors are by the name of the replicate, which begins with its model's.
 
