@@ -40,9 +40,13 @@ from calib.inference.problem import Problem, build_problem
 from calib.inference.record import DATA, POSTERIOR, PRIORS, RUN, Record, RunRecord, read_record
 from calib.models import get_model
 from calib.report import comparison
-from calib.report.again import problem_of, recompute_comparison
-from calib.report.compared import FOLDER
-from calib.report.comparison import FILE, ComparisonRecord
+from calib.report.comparison import (
+    FILE,
+    FOLDER,
+    ComparisonRecord,
+    problem_of,
+    recompute_comparison,
+)
 from calib.report.publish import publication
 from calib.report.sections import SECTIONS, work_out
 from calib.report.study import Progress, Study, estimate_task
@@ -256,17 +260,15 @@ def recompute_report(
     manifest: Manifest, tasks: tuple[Task, ...], out: Path, progress: Progress, pool: Pool
 ) -> Study:
     """Work a report out again and write it into a new folder."""
-    contents = work_out(
+    report = work_out(
         tasks, manifest.seed, settings=manifest.settings, progress=progress, pool=pool,
-        draw=True, pdf=manifest.pdf,
         sections=[SECTIONS[name].again(record) for name, record in manifest.sections.items()],
     )  # fmt: skip
     write_report(
-        contents.study, out, sections=contents.found, pdf=manifest.pdf, settings=manifest.settings,
-        command=manifest.command, title=manifest.title, environment=manifest.environment,
-        drawn=contents.drawn, progress=progress, pool=pool,
+        report, out, pdf=manifest.pdf, settings=manifest.settings, command=manifest.command,
+        title=manifest.title, environment=manifest.environment, progress=progress, pool=pool,
     )  # fmt: skip
-    return contents.study
+    return report.study
 
 
 def _estimates(task: Task, stated: Mapping[str, Any], manifest: Manifest, job: Job) -> list[Item]:

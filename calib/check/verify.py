@@ -39,7 +39,7 @@ from calib.inference.record import (
     RunRecord,
     read_record,
 )
-from calib.report.compared import FOLDER as COMPARED
+from calib.report.comparison import FOLDER as COMPARED
 from calib.report.comparison import ComparisonRecord
 from calib.report.sections import SECTIONS
 from calib.report.study_tasks import HoldOut

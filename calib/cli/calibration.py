@@ -79,7 +79,7 @@ def report(
             only=only or (),
         )
         title = "Calibration report"
-        sections: Sequence[Section] = ()
+        sections: Sequence[Section[Any]] = ()
     else:
         from calib.he2019.designs import he2019_tasks
         from calib.he2019.sections import AuditSection, GapsSection
@@ -91,7 +91,7 @@ def report(
     settings = SamplerSettings(max_steps=max_steps)
     to_prepare = {task.model: (task, task.prior_path) for task in tasks}
     if compare:
-        from calib.report.compared import plan_comparison
+        from calib.report.comparison import plan_comparison
 
         comparison = plan_comparison(
             tasks, compare, {prior_file_model(path): path for path in priors or ()}
@@ -114,13 +114,13 @@ def report(
     with pool(workers) as side, progress_bars() as tell:
         found = work_out(
             tasks, seed, settings=settings, sections=sections, progress=tell, workers=workers,
-            pool=side, draw=True, pdf=pdf,
+            pool=side,
         )  # fmt: skip
         study = found.study
         page = write_report(
-            study, out, settings=settings, command=opt.command(), title=title, sections=found.found,
+            found, out, settings=settings, command=opt.command(), title=title,
             overwrite=overwrite, posteriors=posteriors and views, views=views, pdf=pdf,
-            drawn=found.drawn, progress=tell, pool=side,
+            progress=tell, pool=side,
         )  # fmt: skip
     verdicts = {}
     for key, result in study.successes.items():
@@ -134,11 +134,12 @@ def report(
         print(f"{key}: FAILED: {failure.error}", file=sys.stderr)
     print(page)
     converged = all(r.calibration.converged for r in study.successes.values())
-    for section in found.found:
+    for section, part in found.parts:
         if section.name == "comparison":
-            tell_compared(section.record())
-            print(section.record()["verdict"])
-            converged &= bool(section.record()["converged"])
+            record = section.record(part)
+            tell_compared(record)
+            print(record["verdict"])
+            converged &= bool(record["converged"])
     code = 1 if study.failures else 0 if converged and all(good) else 3
     told = {key: found.document() for key, found in verdicts.items()}
     finish(code, out / "summary.json", folder=str(out), verdicts=told)

@@ -29,7 +29,7 @@ def _later(module: str, name: str) -> Callable[..., Any]:
     return call
 
 
-def _gaps_again(record: Any) -> Section:
+def _gaps_again(record: Any) -> Section[Any]:
     from calib.he2019.gaps import paper_gaps
     from calib.he2019.sections import GapsSection
 
@@ -41,7 +41,7 @@ def _gaps_again(record: Any) -> Section:
     return GapsSection(tuple(gap for name, gap in known.items() if name in record))
 
 
-def _audit_again(record: Any) -> Section:
+def _audit_again(record: Any) -> Section[Any]:
     from calib.he2019.audit import Seeds
     from calib.he2019.sections import AuditSection
 

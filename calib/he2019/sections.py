@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -44,7 +44,7 @@ from calib.report.labels import odds_text, percent, percent_range, unbroken
 from calib.report.numbers import NOTHING, format_number
 from calib.report.page.diagnosis import TONE_MARKS, render_diagnosis
 from calib.report.page.template import data_uri, picture, png_size, sentences, template, unit_html
-from calib.report.sections import Written
+from calib.report.sections import Section, Target
 from calib.report.study import Progress, Study
 
 _TITLE = "Audit of the published tables: He, Sandu & Osorio (2019)"
@@ -162,27 +162,6 @@ def check_text(check: Check) -> tuple[str, str]:
     return heading, f"{check.values['rows']:.0f} field rows: {listed}"
 
 
-def begin_gaps_section(
-    results: Sequence[FoundGap], folder: Path, *, versions: Mapping[str, str], pdf: bool, pool: Pool
-) -> Callable[[Progress], str]:
-    """Ask for figures and pages of the gaps in a report folder; return what waits for the section.
-
-    The folder has ``figures/``; it gets ``figures/gap_NAME.png``, as PDF too if asked, and
-    ``gaps/NAME/``, each what `calib diagnose` writes, its figures inside the page only.
-    """
-    pieces = [pool.submit(_write_gap, r, folder, versions, pdf) for r in results]
-
-    def finish(tell: Progress) -> str:
-        blocks = []
-        for i, piece in enumerate(pieces):
-            tell("the paper's own gaps: drawing", i, len(pieces))
-            blocks.append(piece.result())
-        tell("the paper's own gaps: drawing", len(pieces), len(pieces))
-        return template("gaps.html.j2", "calib.he2019").render(gaps=blocks)
-
-    return finish
-
-
 def _write_gap(
     result: FoundGap, folder: Path, versions: Mapping[str, str], pdf: bool
 ) -> dict[str, Any]:
@@ -256,76 +235,57 @@ def _withheld(result: FoundGap) -> str:
 
 
 @dataclass(frozen=True)
-class GapsSection:
+class GapsSection(Section[tuple[FoundGap, ...]]):
     """The paper's own gaps, to be diagnosed."""
 
     gaps: Sequence[PaperGap] = field(default_factory=paper_gaps)
+    name, anchor, badge = "paper_gaps", "paper-gaps", "reconstructed data"
+    heading = "Where the paper's own models miss"
 
-    def begin(self, seed: int, pool: Pool) -> Callable[[Study, Progress], FoundGaps]:
-        """Ask for the diagnoses."""
-        finish = begin_gaps(seed, self.gaps, pool)
-        return lambda study, tell: FoundGaps(finish(tell))
+    def work_out(self, study: Study, pool: Pool, tell: Progress) -> tuple[FoundGap, ...]:
+        """Diagnose the gaps."""
+        return begin_gaps(study.seed, self.gaps, pool)(tell)
 
-
-@dataclass(frozen=True)
-class FoundGaps:
-    """The paper's own gaps, diagnosed."""
-
-    results: tuple[FoundGap, ...]
-    name: str = "paper_gaps"
-
-    def summary(self) -> dict[str, Any]:
+    def summary(self, part: tuple[FoundGap, ...]) -> dict[str, Any]:
         """Return the numbers by the gaps' names."""
-        return summarise_gaps(self.results)
+        return summarise_gaps(part)
 
-    def record(self) -> dict[str, Any]:
+    def record(self, part: tuple[FoundGap, ...]) -> dict[str, Any]:
         """Return the seeds by the gaps' names."""
-        return {r.gap.name: {"seed": r.found.seed} for r in self.results}
+        return {r.gap.name: {"seed": r.found.seed} for r in part}
 
-    def begin(
-        self, folder: Path, *, versions: Mapping[str, str], pdf: bool, pool: Pool
-    ) -> Callable[[Progress], Written]:
-        """Ask for figures and pages."""
-        finish = begin_gaps_section(self.results, folder, versions=versions, pdf=pdf, pool=pool)
-        return lambda tell: Written(
-            "paper-gaps", "Where the paper's own models miss", "reconstructed data", finish(tell)
-        )
+    def view(self, part: tuple[FoundGap, ...], to: Target) -> str:
+        """Write figures and pages of the gaps, and render the section.
+
+        The folder gets ``figures/gap_NAME.png``, as PDF too if asked, and ``gaps/NAME/``, each what
+        `calib diagnose` writes, its figures inside the page only.
+        """
+        pieces = [to.pool.submit(_write_gap, r, to.folder, to.versions, to.pdf) for r in part]
+        blocks = []
+        for i, piece in enumerate(pieces):
+            to.tell("the paper's own gaps: drawing", i, len(pieces))
+            blocks.append(piece.result())
+        to.tell("the paper's own gaps: drawing", len(pieces), len(pieces))
+        return template("gaps.html.j2", "calib.he2019").render(gaps=blocks)
 
 
 @dataclass(frozen=True)
-class AuditSection:
+class AuditSection(Section[Audit]):
     """The audit of the published tables, each search repeated over so many seeds."""
 
     seeds: Seeds = field(default_factory=Seeds)
+    name, anchor, heading = "audit", "audit", "Audit of the published tables"
 
-    def begin(self, seed: int, pool: Pool) -> Callable[[Study, Progress], FoundAudit]:
-        """Ask for what takes long."""
-        begun = begin_audit(seed, self.seeds, pool)
+    def work_out(self, study: Study, pool: Pool, tell: Progress) -> Audit:
+        """Audit the tables, with the study's calibration of rut depth if it has one."""
+        rut = study.successes.get("rut_depth")
+        begun = begin_audit(study.seed, self.seeds, pool)
+        return begun(None if rut is None else rut.calibration, tell)
 
-        def finish(study: Study, tell: Progress) -> FoundAudit:
-            rut = study.successes.get("rut_depth")
-            return FoundAudit(begun(None if rut is None else rut.calibration, tell))
-
-        return finish
-
-
-@dataclass(frozen=True)
-class FoundAudit:
-    """The audit, to be written."""
-
-    audit: Audit
-    name: str = "audit"
-
-    def summary(self) -> None:
-        """Return nothing: its numbers are in files of their own."""
-
-    def record(self) -> dict[str, Any]:
+    def record(self, part: Audit) -> dict[str, Any]:
         """Return its seed, and how often searches were repeated."""
-        return {"seed": self.audit.seed, "seeds": asdict(self.audit.seeds)}
+        return {"seed": part.seed, "seeds": asdict(part.seeds)}
 
-    def begin(
-        self, folder: Path, *, versions: Mapping[str, str], pdf: bool, pool: Pool
-    ) -> Callable[[Progress], Written]:
-        """Ask for the files and the piece of the page."""
-        piece = pool.submit(write_audit, self.audit, folder)
-        return lambda tell: Written("audit", "Audit of the published tables", "", piece.result())
+    def view(self, part: Audit, to: Target) -> str:
+        """Write numbers and figures, and render the section."""
+        return to.pool.submit(write_audit, part, to.folder).result()

@@ -1,6 +1,8 @@
-"""What a comparison leaves: `comparison.json`, the figure, a page, and a run folder per model.
+"""Models compared on the same rows: the document, its views, and the section of a report.
 
-With the rows that were held out and a hash of every file, so that it can be computed again.
+A folder of `calib compare` has `comparison.json`, a figure, a page, a run folder for each model,
+the rows that were held out and a hash of every file, so that it can be computed again. A report
+that compares models has such a folder beside its page.
 """
 
 from __future__ import annotations
@@ -8,7 +10,7 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -17,10 +19,15 @@ from matplotlib.figure import Figure
 from pydantic import Field
 
 from calib.batch.environment import Environment
-from calib.data import write_table
+from calib.batch.pool import Pool
+from calib.data import read_for_model, write_table
+from calib.data.quantities import OUTPUTS
+from calib.errors import CalibError
 from calib.inference.calibration import Calibration
-from calib.inference.io import load_calibration, save_calibration
-from calib.inference.record import Entry, File, Hash, KnownModel, Record, read_record
+from calib.inference.io import load_calibration, run_problem, save_calibration
+from calib.inference.problem import Problem, build_problem
+from calib.inference.record import Entry, File, Hash, KnownModel, Record, RunRecord, read_record
+from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import get_model
 from calib.models.base import Array
 from calib.report.figures.plate import mark
@@ -28,9 +35,20 @@ from calib.report.figures.style import BLACK, BLUE, legend_below, panels, png_by
 from calib.report.labels import aligned, axis_of, units_of
 from calib.report.numbers import finite, format_number
 from calib.report.page.template import data_uri, template
+from calib.report.sections import Section, Target
+from calib.report.study import Progress, Study
+from calib.report.study_tasks import Task, fitted_rows
 from calib.report.verdict import Verdict, keep_verdict, kept_verdict, verdict
 from calib.report.writer import file_hashes, own_names
-from calib.validation.comparison import Candidate, Comparison, difference, sentence
+from calib.validation.comparison import (
+    Candidate,
+    Comparison,
+    check_comparable,
+    compare,
+    compare_problems,
+    difference,
+    sentence,
+)
 from calib.validation.prediction import N_DRAWS
 from calib.validation.validate import PARETO_K_MAX
 
@@ -339,3 +357,132 @@ def load_stack(folder: Path) -> tuple[dict[str, Any], list[tuple[float, Calibrat
     used = {name: m.weight for name, m in record.models.items() if round(m.weight * N_DRAWS) > 0}
     runs = [(weight, load_calibration(folder / "runs" / name)) for name, weight in used.items()]
     return record.document, runs
+
+
+def recompute_comparison(
+    record: ComparisonRecord, problems: Mapping[str, Problem], folder: Path, out: Path,
+    progress: Progress, workers: int,
+) -> Comparison:  # fmt: skip
+    """Compare the models of a folder again, and write that into an empty one, as in the record."""
+    held_out = None
+    if record.held_out:
+        models = [p.bound.model for p in problems.values()]
+        used = sorted({c for m in models for c in (*m.conditions, m.output)})
+        held_out = read_for_model(folder / HELD_OUT, used)
+    again = compare_problems(
+        list(problems.values()), record.seed, held_out=held_out, settings=record.settings,
+        progress=progress, workers=workers,
+    )  # fmt: skip
+    # Differences are from the first, which with other draws may not be the best.
+    by_name = {c.model: c for c in again.candidates}
+    again = replace(again, candidates=tuple(by_name[name] for name in record.models))
+    write_comparison(again, out, record.command, record.held_out, environment=record.environment)
+    return again
+
+
+def problem_of(run: RunRecord, data: Path, record: ComparisonRecord) -> Problem:
+    """Return a run's problem, its columns named as in the file that was compared on.
+
+    Units are shown by these names, where they are not those of the copy that is kept.
+    """
+    problem = run_problem(run, data)
+    if not record.header:
+        return problem
+    return problem.with_table(replace(problem.table, header=record.header, text=()))
+
+
+FOLDER = "compared"
+
+
+@dataclass(frozen=True)
+class StatedComparison(Section[Mapping[str, Any]]):
+    """A comparison as a manifest states it; `calib.check` makes its folder again by itself."""
+
+    document: Mapping[str, Any]
+    name, anchor, heading = "comparison", "comparison", "Which model the data prefer"
+
+    def work_out(self, study: Study, pool: Pool, tell: Progress) -> Mapping[str, Any]:
+        """Return the document."""
+        return self.document
+
+    def record(self, part: Mapping[str, Any]) -> dict[str, Any]:
+        """Return every number."""
+        return dict(part)
+
+    def view(self, part: Mapping[str, Any], to: Target) -> str:
+        """Render the table and the verdict."""
+        head, rows = table(part)
+        return template("compared.html.j2").render(
+            found=part, head=head, rows=rows, page=f"{FOLDER}/{PAGE}"
+        )
+
+    @classmethod
+    def again(cls, record: Any) -> StatedComparison:
+        """Return the section of a manifest's record; raise ValueError if it is none."""
+        try:
+            table(record)
+            str(record["verdict"]), str(record["rows"])
+        except (KeyError, TypeError, AttributeError, ValueError):
+            raise ValueError("no record of a comparison") from None
+        return cls(record)
+
+
+@dataclass(frozen=True)
+class ComparisonSection(Section[Comparison]):
+    """Models to be compared on the rows of a task, those that it holds out among them."""
+
+    task: Task
+    models: Sequence[str]
+    priors: Mapping[str, Path] = field(default_factory=dict)
+    settings: SamplerSettings | None = None
+    command: Sequence[str] = ()
+    workers: int = 1
+    name, anchor, heading = "comparison", "comparison", "Which model the data prefer"
+
+    def work_out(self, study: Study, pool: Pool, tell: Progress) -> Comparison:
+        """Compare them; processes of its own leave rows out."""
+        fitted, held = fitted_rows(self.task)
+        return compare(
+            fitted, self.models, study.seed, held_out=held, priors=self.priors,
+            settings=self.settings, progress=tell, workers=self.workers,
+        )  # fmt: skip
+
+    @property
+    def _held_out(self) -> str:
+        return "" if self.task.held_out is None else str(self.task.held_out)
+
+    def record(self, part: Comparison) -> dict[str, Any]:
+        """Return every number."""
+        return document(part, self._held_out)
+
+    def view(self, part: Comparison, to: Target) -> str:
+        """Write the folder, and render the table and the verdict."""
+        (to.folder / FOLDER).mkdir()
+        found = write_comparison(part, to.folder / FOLDER, self.command, self._held_out)
+        return StatedComparison(found).view(found, to)
+
+
+def plan_comparison(
+    tasks: Sequence[Task], models: Sequence[str], priors: Mapping[str, Path]
+) -> ComparisonSection:
+    """Find the task whose output the models predict, and check that each can be fitted.
+
+    Raises
+    ------
+    CalibError
+        If they are not two models of one output, it is not in the report, or a column is not.
+    """
+    check_comparable(models)
+    output = get_model(models[0]).output
+    task = next((t for t in tasks if OUTPUTS[t.output] == output), None)
+    if task is None:
+        raise CalibError(
+            f"the models to compare predict {output}, which the report does not have",
+            expected="models of " + ", ".join(OUTPUTS[t.output] for t in tasks),
+            hint="add the file that has it, or compare others",
+        )
+    own = {} if task.prior_path is None else {task.model: task.prior_path}
+    given = {**own, **priors}
+    for name in models:
+        build_problem(name, fitted_rows(task)[0], given.get(name))
+    return ComparisonSection(task, models, given)

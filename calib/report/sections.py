@@ -1,21 +1,21 @@
-"""What a report shows: the study, and sections beside its outputs, hung on by their packages.
+"""A report: a study of outputs, and sections beside them that packages register.
 
-A section is asked for with what it is to work out, begun where the outputs are, and writes itself:
-files into the report's folder, numbers into ``summary.json``, what it takes to work it out again
-into ``manifest.json``, and a piece of the page. That of emulated simulators is here, that of
-compared models in `calib.report.compared`.
+A section works its part out, says what `summary.json` and `manifest.json` keep of that part, and
+writes its view of it: files in the report's folder and a piece of the page. The section on emulated
+simulators is here, that on compared models in `calib.report.comparison`.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from calib.batch.pool import HERE, Later, Pool
+from calib.batch.pool import HERE, Pool
 from calib.data.files import plain_number
 from calib.data.registry import Registry
 from calib.report.numbers import format_number
@@ -23,56 +23,68 @@ from calib.report.numbers import format_number
 # Every command loads what plug-ins declare here, and few work a report out.
 if TYPE_CHECKING:
     from calib.inference.sampling.sampler import SamplerSettings
-    from calib.report.drawing import Drawn
     from calib.report.study import Progress, Study
     from calib.report.study_tasks import Task
 
 type Document = Mapping[str, Any]
 
-# So many failed runs are shown; the manifest has all.
-_SHOWN = 20
-# Of the intervals that an emulator is checked by.
-_NOMINAL = 0.9
-
 
 @dataclass(frozen=True)
-class Written:
-    """A section of the page; the badge beside its heading says what its data are called."""
+class Target:
+    """Where a section writes its files, and how.
 
-    anchor: str
-    heading: str
-    badge: str
-    html: str
+    Parameters
+    ----------
+    folder : Path
+        Of the report; it has ``figures``.
+    versions : mapping of str to str
+        Of the packages, for pages in the folder.
+    pdf : bool
+        Whether figures also come as PDF.
+    pool : Pool
+        Where figures are drawn.
+    tell : callable
+        Called with a step's name, the steps done and planned.
+    """
 
-
-class Found(Protocol):
-    """What a section found, ready to be written."""
-
-    @property
-    def name(self) -> str:
-        """Key of the section in summary and manifest."""
-
-    def summary(self) -> dict[str, Any] | None:
-        """Return what `summary.json` gets; None for nothing."""
-
-    def record(self) -> dict[str, Any]:
-        """Return what `manifest.json` gets, from which `SectionKind.again` makes the section."""
-
-    def begin(
-        self, folder: Path, *, versions: Mapping[str, str], pdf: bool, pool: Pool
-    ) -> Callable[[Progress], Written]:
-        """Ask for the files in a report's folder; return what waits for the piece of the page."""
+    folder: Path
+    versions: Mapping[str, str]
+    pdf: bool = False
+    pool: Pool = HERE
+    tell: Progress = lambda what, done, planned: None
 
 
-class Section(Protocol):
-    """What is to be worked out."""
+class Section[Part](ABC):
+    """A section of a report; `Part` is what it finds.
 
-    def begin(self, seed: int, pool: Pool) -> Callable[[Study, Progress], Found]:
-        """Ask for the work; return what waits for it, given what the outputs gave."""
+    Attributes
+    ----------
+    name : str
+        Key in ``manifest.json`` and ``summary.json``.
+    anchor, heading, badge : str
+        On the page; the badge says what its data are called.
+    """
 
+    name: ClassVar[str]
+    anchor: ClassVar[str]
+    heading: ClassVar[str]
+    badge: ClassVar[str] = ""
 
-def _nothing(folder: Path, files: Mapping[str, str]) -> dict[str, str]:
-    return {}
+    @abstractmethod
+    def work_out(self, study: Study, pool: Pool, tell: Progress) -> Part:
+        """Return what is found, given the study; random numbers follow from its seed."""
+
+    @abstractmethod
+    def record(self, part: Part) -> dict[str, Any]:
+        """Return what `manifest.json` keeps, from which `SectionKind.again` makes the section."""
+
+    def summary(self, part: Part) -> dict[str, Any] | None:
+        """Return what `summary.json` keeps; None for nothing."""
+        return None
+
+    @abstractmethod
+    def view(self, part: Part, to: Target) -> str:
+        """Write the files of the section and return its piece of the page."""
 
 
 @dataclass(frozen=True)
@@ -90,8 +102,8 @@ class SectionKind:
     """
 
     name: str
-    again: Callable[[Any], Section]
-    derived: Callable[[Path, Mapping[str, str]], dict[str, str]] = _nothing
+    again: Callable[[Any], Section[Any]]
+    derived: Callable[[Path, Mapping[str, str]], dict[str, str]] = lambda folder, files: {}
 
     def register(self) -> None:
         """Have reports with such a section checked."""
@@ -99,86 +111,58 @@ class SectionKind:
 
 
 @dataclass(frozen=True)
-class EmulatorSection:
-    """What became of the emulations, as their `Emulation.document`, by model."""
+class EmulatorSection(Section[Mapping[str, Document]]):
+    """How the emulations went, as their `Emulation.document`, by model.
+
+    They were made before the study. A check does not run the simulator again.
+    """
 
     documents: Mapping[str, Document]
+    name, anchor, heading = "emulators", "emulators", "Emulators of slow simulators"
 
-    def begin(self, seed: int, pool: Pool) -> Callable[[Study, Progress], FoundEmulators]:
-        """Return what hands them on: they were made before the study."""
-        return lambda study, tell: FoundEmulators(self.documents)
+    def work_out(self, study: Study, pool: Pool, tell: Progress) -> Mapping[str, Document]:
+        """Return the documents."""
+        return self.documents
 
+    def record(self, part: Mapping[str, Document]) -> dict[str, Any]:
+        """Return the documents."""
+        return {model: dict(document) for model, document in part.items()}
 
-@dataclass(frozen=True)
-class FoundEmulators:
-    """The emulations, ready to be written: how many runs, how good, which failed."""
+    def view(self, part: Mapping[str, Document], to: Target) -> str:
+        """Render the table of emulators, and of the first runs that failed."""
+        from calib.report.page.template import template
 
-    documents: Mapping[str, Document]
-    name: str = "emulators"
+        quarters = {
+            model: np.histogram(d["held_out"]["pit"], bins=4, range=(0.0, 1.0))[0]
+            for model, d in part.items() if d["held_out"]
+        }  # fmt: skip
+        return template("emulators.html.j2").render(
+            documents=part, quarters={m: n / max(1, n.sum()) for m, n in quarters.items()},
+            coverage_words=coverage_words, plain_number=plain_number, shown=20,
+        )  # fmt: skip
 
-    def summary(self) -> None:
-        """Add nothing to the summary: a check does not run the simulator again."""
-
-    def record(self) -> dict[str, Any]:
-        """Return all there is to know for the manifest."""
-        return {model: dict(document) for model, document in self.documents.items()}
-
-    def begin(
-        self, folder: Path, *, versions: Mapping[str, str], pdf: bool, pool: Pool
-    ) -> Callable[[Progress], Written]:
-        """Return what writes the piece of the page."""
-        return lambda tell: Written(
-            "emulators", "Emulators of slow simulators", "", _emulators_html(self.documents)
-        )
-
-
-def _emulators_html(documents: Mapping[str, Document]) -> str:
-    from calib.report.page.template import template
-
-    failed = [
-        {
-            "model": model,
-            "n": len(d["failed"]),
-            "rows": [
-                (", ".join(plain_number(v, 4) for v in f["parameters"]), f["kind"], f["reason"],
-                 f["printed"].strip()[-200:])
-                for f in d["failed"][:_SHOWN]
-            ],
-        }
-        for model, d in documents.items() if d["failed"]
-    ]  # fmt: skip
-    rows = [_emulator_row(model, d) for model, d in documents.items()]
-    return template("emulators.html.j2").render(rows=rows, failed=failed)
-
-
-def _emulator_row(model: str, d: Document) -> list[str]:
-    held: Document = d["held_out"] or {}
-    seen, inside, shares = "none left", "", "none"
-    if held:
-        pit = np.histogram(held["pit"], bins=4, range=(0.0, 1.0))[0]
-        seen = f"{format_number(held['rmse_in_noise_sds'])} on {held['runs']}"
-        inside = coverage_words(held["covered_90"], len(held["pit"]))
-        shares = ", ".join(f"{100 * part:.0f} %" for part in pit / max(int(pit.sum()), 1))
-    return [
-        model, str(d["runs"]), str(d["nodes"]), seen, inside, shares,
-        format_number(d["between_nodes_error_in_noise_sds"]),
-        format_number(d["simulator_noise_sd"]) if d["simulator_noise_sd"] else "none",
-        "good enough" if d["passed"] else "; ".join(d["reasons"]),
-    ]  # fmt: skip
+    @classmethod
+    def again(cls, record: Any) -> EmulatorSection:
+        """Return the section of a manifest's record; raise ValueError if it is none."""
+        if not isinstance(record, Mapping) or not all(
+            isinstance(d, Mapping) for d in record.values()
+        ):
+            raise ValueError("no record of emulators")
+        return cls(record)
 
 
 def coverage_words(share: float, n: int) -> str:
     """Say which share of n values that it had not seen an emulator's 90 % intervals hold.
 
-    The values are the coefficients of each run, errors of which the emulator takes as independent.
+    The values are the coefficients of each run; the emulator takes their errors as independent.
     """
     from calib.validation.scores import jeffreys
 
     low, high = jeffreys(round(n * share), n)
     found = f"{100 * share:.0f} % (95 % interval {100 * low:.0f} to {100 * high:.0f} %): "
-    if high < _NOMINAL:
+    if high < 0.9:
         return f"{found}too narrow"
-    return found + ("wider than need be" if low > _NOMINAL else "as they should be")
+    return found + ("wider than need be" if low > 0.9 else "as they should be")
 
 
 def emulation_words(d: Document) -> str:
@@ -195,34 +179,24 @@ def emulation_words(d: Document) -> str:
     )
 
 
-def _emulators_again(record: Any) -> Section:
-    if not isinstance(record, Mapping) or not all(isinstance(d, Mapping) for d in record.values()):
-        raise ValueError("no record of emulators")
-    return EmulatorSection(record)
+def _comparison_again(record: Any) -> Section[Any]:
+    from calib.report.comparison import StatedComparison
 
-
-def _comparison_again(record: Any) -> Section:
-    from calib.report.compared import stated_again
-
-    return stated_again(record)
+    return StatedComparison.again(record)
 
 
 SECTIONS: Registry[SectionKind] = Registry(
-    "section", lambda kind: kind.name, SectionKind("emulators", _emulators_again),
+    "section", lambda kind: kind.name, SectionKind("emulators", EmulatorSection.again),
     SectionKind("comparison", _comparison_again),
 )  # fmt: skip
 
 
 @dataclass(frozen=True)
-class Contents:
-    """What `calib.report.writer.write_report` writes: the study, and what its sections found.
-
-    Figures of the study's outputs are being drawn if they were asked for, else None.
-    """
+class Report:
+    """All that `calib.report.writer.write_report` writes: the study, and the sections' parts."""
 
     study: Study
-    found: tuple[Found, ...]
-    drawn: Mapping[str, Later[Drawn]] | None = None
+    parts: tuple[tuple[Section[Any], Any], ...] = ()
 
 
 def work_out(
@@ -230,42 +204,27 @@ def work_out(
     seed: int,
     *,
     settings: SamplerSettings | None = None,
-    sections: Sequence[Section] = (),
+    sections: Sequence[Section[Any]] = (),
     progress: Progress | None = None,
     workers: int = 1,
     pool: Pool = HERE,
-    draw: bool = False,
-    pdf: bool = False,
-) -> Contents:
-    """Work everything out that a report shows.
+) -> Report:
+    """Work out all that a report shows.
 
     Parameters
     ----------
     sections : sequence of Section
-        What the report has beside its outputs.
+        Beside the outputs, in their order on the page.
     progress : callable, optional
-        Called with what is being done, steps done and steps planned.
+        Called with a step's name, the steps done and planned.
     workers : int
-        Processes for leaving rows out, where outputs are worked out here.
+        Processes for leaving rows out, where outputs are worked out in this process.
     pool : Pool, optional
-        Where outputs and sections are worked out, in any order. The numbers depend neither on it
-        nor on `workers`.
-    draw, pdf : bool
-        Whether to ask for figures as soon as there are outputs, and for PDF besides.
+        Where outputs and sections are worked out. The numbers depend neither on it nor on
+        `workers`.
     """
-    from calib.report.drawing import begin_figures
-    from calib.report.study import begin_study
+    from calib.report.study import work_out_study
 
     tell = progress or (lambda what, done, planned: None)
-    study = begin_study(
-        tasks, seed, pool, settings=settings, progress=progress,
-        workers=workers if pool.here else 1,
-    )  # fmt: skip
-    begun = [section.begin(seed, pool) for section in reversed(sections)]
-    pool.help()
-    studied = study(tell)
-    # Drawn while the last of the sections' pieces, fewer than processes, are worked out.
-    drawn = begin_figures(studied, pool, pdf=pdf) if draw else None
-    # What a section has to do here is done while the pieces of those before it are worked out.
-    found = [finish(studied, tell) for finish in begun]
-    return Contents(studied, tuple(reversed(found)), drawn)
+    study = work_out_study(tasks, seed, pool, settings=settings, tell=tell, workers=workers)
+    return Report(study, tuple((s, s.work_out(study, pool, tell)) for s in sections))

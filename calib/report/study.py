@@ -99,35 +99,25 @@ class Study:
         return {k: r for k, r in self.results.items() if isinstance(r, Failure)}
 
 
-def begin_study(
+def work_out_study(
     tasks: Sequence[Task],
     seed: int,
     pool: Pool,
     *,
     settings: SamplerSettings | None = None,
-    progress: Progress | None = None,
+    tell: Progress,
     workers: int = 1,
-) -> Callable[[Progress], Study]:
-    """Ask for every output; return what waits for them.
-
-    Where they are worked out here, `progress` is called with what is being done, steps done and
-    steps planned. The numbers do not depend on the number of workers, which leave rows out.
-    """
+) -> Study:
+    """Work every output out; see `calib.report.sections.work_out`."""
     began = time.perf_counter()
-    inner = progress if pool.here else None
-    pieces = {
-        t.output: pool.submit(_attempt, t, seed, settings, inner or _silent, workers) for t in tasks
-    }
-
-    def finish(tell: Progress) -> Study:
-        results = {}
-        for i, (key, piece) in enumerate(pieces.items()):
-            results[key] = piece.result()
-            if not pool.here:
-                tell("outputs", i + 1, len(pieces))
-        return Study(results, seed, time.perf_counter() - began)
-
-    return finish
+    inner, inside = (tell, workers) if pool.here else (_silent, 1)
+    pieces = {t.output: pool.submit(_attempt, t, seed, settings, inner, inside) for t in tasks}
+    results = {}
+    for i, (key, piece) in enumerate(pieces.items()):
+        results[key] = piece.result()
+        if not pool.here:
+            tell("outputs", i + 1, len(pieces))
+    return Study(results, seed, time.perf_counter() - began)
 
 
 @one_thread()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import Any
 
 from calib.batch.environment import Environment, sha256
 from calib.batch.folders import fresh_folder
-from calib.batch.pool import HERE, Later, Pool
+from calib.batch.pool import HERE, Pool
 from calib.data import Table, write_table
 from calib.data.files import read_text
 from calib.inference.estimators import GeneticSettings
@@ -20,11 +20,10 @@ from calib.inference.prior_files import default_priors
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import get_model
 from calib.models.simulators.emulator import emulator_of, save_emulator
-from calib.report.drawing import Drawn, begin_figures
-from calib.report.figures.plate import Plate
+from calib.report.figures.collect import draw
 from calib.report.page.content import render_page
 from calib.report.publish import publication
-from calib.report.sections import Found
+from calib.report.sections import Report, Target
 from calib.report.study import OutputResult, Progress, Study
 from calib.report.study_tasks import Task
 from calib.report.summary import summarise
@@ -41,29 +40,21 @@ def file_hashes(folder: Path) -> dict[str, str]:
     }
 
 
-def build_manifest(
-    study: Study,
-    settings: SamplerSettings,
-    command: Sequence[str],
-    inputs: Mapping[str, Mapping[str, Any]],
-    *,
-    title: str = "",
-    environment: Environment | None = None,
-) -> dict[str, Any]:
-    """Return the manifest of a study, its file hashes still to be added.
-
-    `inputs` are for every output the files its data and priors were copied to, and their hashes.
-    ``seconds`` is the one place of a report that holds durations, which no two runs share.
-    """
+def _manifest(
+    report: Report, settings: SamplerSettings, command: Sequence[str], title: str,
+    environment: Environment, inputs: Mapping[str, Mapping[str, Any]],
+) -> dict[str, Any]:  # fmt: skip
+    """Return what it takes to make the report again; ``seconds`` alone differ between two runs."""
+    study = report.study
     return {
         "schema": SCHEMA,
         "title": title,
         "command": list(command),
         "seed": study.seed,
-        **(environment or Environment.here()).document(),
+        **environment.document(),
         "settings": json.loads(json.dumps(asdict(settings))),
         "genetic_algorithm": asdict(GeneticSettings()),
-        "tasks": {k: _task(r.task, inputs[k]) for k, r in study.results.items()},
+        "tasks": {key: _task(r.task, inputs[key]) for key, r in study.results.items()},
         "seconds": {
             "study": study.seconds,
             **{
@@ -75,29 +66,22 @@ def build_manifest(
 
 
 def _task(task: Task, inputs: Mapping[str, Any]) -> dict[str, Any]:
-    held = task.held_out
-    return {
-        "model": task.model,
-        "held_out": None if held is None else {"column": held.column, "value": held.value},
-        "label": task.table.label,
-        **inputs,
-    }
+    held = None if task.held_out is None else asdict(task.held_out)
+    return {"model": task.model, "held_out": held, "label": task.table.label, **inputs}
 
 
 def write_report(
-    study: Study,
+    report: Report,
     out: Path,
     *,
     settings: SamplerSettings,
     command: Sequence[str],
     title: str,
-    sections: Sequence[Found] = (),
     overwrite: bool = False,
     posteriors: bool = True,
     views: bool = True,
     environment: Environment | None = None,
     pdf: bool = False,
-    drawn: Mapping[str, Later[Drawn]] | None = None,
     progress: Progress | None = None,
     pool: Pool = HERE,
 ) -> Path:
@@ -107,8 +91,6 @@ def write_report(
     ----------
     settings : SamplerSettings
         Of the study, for the manifest; so is the command line.
-    sections : sequence of Found
-        What it shows beside its outputs, in their order on the page.
     posteriors : bool
         Whether to keep the netCDF files, which are megabytes. Where they are left out, the
         manifest says so and has their hashes.
@@ -119,8 +101,6 @@ def write_report(
         Where the manifest says the report was made: that of this process by default.
     pdf : bool
         Whether every figure also comes as PDF, for print.
-    drawn : mapping of str to Later of Drawn, optional
-        Figures of the outputs, if they were asked for already.
     pool : Pool, optional
         Where figures are drawn.
 
@@ -130,67 +110,46 @@ def write_report(
         If the folder exists, and an earlier report is not to be replaced, or cannot be written.
     """
     tell = progress or (lambda what, done, planned: None)
-    successes = study.successes
+    study, where = report.study, environment or Environment.here()
     with fresh_folder(out, overwrite=overwrite) as folder:
-        inputs = _copy_inputs(study, folder)
         (folder / "figures").mkdir()
-        pieces = begin_figures(study, pool, pdf=pdf) if drawn is None else drawn
-        versions = (environment or Environment.here()).versions
-        begun = [s.begin(folder, versions=versions, pdf=pdf, pool=pool) for s in sections]
-        # Short, so last: both processes end at about the same time.
-        kept = [pool.submit(_keep, key, result, folder) for key, result in successes.items()]
+        drawing = {key: pool.submit(draw, key, r, pdf=pdf) for key, r in study.successes.items()}
+        kept = [pool.submit(_keep, key, r, folder) for key, r in study.successes.items()]
+        manifest = _manifest(
+            report, settings, command, title, where, _copy_inputs(study, folder)
+        ) | {"pdf": pdf}  # fmt: skip
         summary = summarise(study)
-        for section in sections:
-            numbers = section.summary()
-            if numbers is not None:
+        for section, part in report.parts:
+            if (numbers := section.summary(part)) is not None:
                 summary[section.name] = numbers
         (folder / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
-        manifest = build_manifest(
-            study, settings, command, inputs, title=title, environment=environment
-        )
-        manifest["pdf"] = pdf
         paper = publication(manifest, summary)
         for path, text in paper.files.items():
             (folder / path).parent.mkdir(exist_ok=True)
             (folder / path).write_text(text, encoding="utf-8")
-        manifest |= {section.name: section.record() for section in sections}
-        plates: dict[str, tuple[Plate, ...]] = {}
-        images: dict[str, bytes] = {}
-        for i, (key, piece) in enumerate(pieces.items()):
-            tell("drawing figures", i, len(pieces))
-            found = piece.result()
-            plates[key] = found.plates
-            images |= found.images
-            for name, content in {**found.images, **found.prints}.items():
+        to = Target(folder, where.versions, pdf, pool, tell)
+        more = [(section, section.view(part, to)) for section, part in report.parts]
+        manifest |= {section.name: section.record(part) for section, part in report.parts}
+        drawn = {}
+        for i, (key, piece) in enumerate(drawing.items()):
+            tell("drawing figures", i, len(drawing))
+            drawn[key] = piece.result()
+            for name, content in drawn[key].files.items():
                 (folder / "figures" / name).write_bytes(content)
-        tell("drawing figures", len(pieces), len(pieces))
+        tell("drawing figures", len(drawing), len(drawing))
         for netcdf in kept:
             netcdf.result()
-        page = render_page(
-            study,
-            plates,
-            images,
-            manifest=manifest,
-            title=title,
-            more=[finish(tell) for finish in begun],
-            reconstructed=any(r.task.table.label for r in study.results.values()),
-            paper=paper,
-        )
+        page = render_page(study, drawn, manifest=manifest, more=more, paper=paper)
         (folder / "index.html").write_text(page, encoding="utf-8")
         files = file_hashes(folder)
-        left_out = [] if posteriors else [f"{key}.nc" for key in successes]
+        left_out = [] if posteriors else [f"{key}.nc" for key in study.successes]
         manifest["views"] = views
         manifest["left_out"] = {name: files.pop(name) for name in left_out}
         if not views:
             del manifest["seconds"]
             files = {name: files[name] for name in files if _is_kept(name)}
-        for made in sorted(folder.rglob("*"), reverse=True):  # what is in a folder before it
-            if made.is_dir():
-                with suppress(OSError):  # not empty
-                    made.rmdir()
-            elif made.relative_to(folder).as_posix() not in files:
-                made.unlink()
         manifest["files"] = files
+        _remove_all_but(files, folder)
         (folder / "manifest.json").write_text(json.dumps(manifest, indent=1) + "\n")
     return Path(out) / ("index.html" if views else "summary.json")
 
@@ -200,6 +159,16 @@ def _is_kept(name: str) -> bool:
     return name.startswith(("data/", "priors/", "emulators/")) or (
         "/" not in name and name.endswith(".json")
     )
+
+
+def _remove_all_but(files: Collection[str], folder: Path) -> None:
+    """Remove every other file, and the folders that this leaves empty."""
+    for made in sorted(folder.rglob("*"), reverse=True):  # what is in a folder before it
+        if made.is_dir():
+            with suppress(OSError):  # not empty
+                made.rmdir()
+        elif made.relative_to(folder).as_posix() not in files:
+            made.unlink()
 
 
 def _keep(key: str, result: OutputResult, folder: Path) -> None:

@@ -33,8 +33,8 @@ from calib.report.figures.plate import Plate
 from calib.report.figures.posterior import learned_plate
 from calib.report.figures.style import style
 from calib.report.reference import NOTHING, Reference
-from calib.report.sections import work_out
-from calib.report.study import OutputResult, Study
+from calib.report.sections import Report, work_out
+from calib.report.study import OutputResult
 from calib.report.study_tasks import Task
 from calib.report.writer import write_report
 from calib.validation.comparison import compare
@@ -58,14 +58,14 @@ def rut_tasks() -> list[Task]:
     return [task for task in he2019_tasks() if task.output == "rut_depth"]
 
 
-def rut_study(seed: int = 2019) -> Study:
-    return work_out(rut_tasks(), seed, settings=SETTINGS).study
+def rut_study(seed: int = 2019) -> Report:
+    return work_out(rut_tasks(), seed, settings=SETTINGS)
 
 
-def write(study: Study, out: Path, **kwargs: Any) -> Path:
+def write(found: Report, out: Path, **kwargs: Any) -> Path:
     with patch("calib.report.figures.collect.plates", two_plates):
         write_report(
-            study, out, settings=SETTINGS, command=["calib", "report"], title="A report", **kwargs
+            found, out, settings=SETTINGS, command=["calib", "report"], title="A report", **kwargs
         )
     return out
 
@@ -80,7 +80,7 @@ def whole(out: Path) -> Path:
     gaps = [gap for gap in paper_gaps() if gap.name == "plain_bekker"]
     sections = [GapsSection(gaps), AuditSection(Seeds(1, 1, 1))]
     found = work_out(rut_tasks(), 2019, settings=SETTINGS, sections=sections)
-    return write(found.study, out, sections=found.found, pdf=True)
+    return write(found, out, pdf=True)
 
 
 def run(out: Path) -> Path:

@@ -16,7 +16,7 @@ from calib.check.outcome import Status
 from calib.data import read_table
 from calib.errors import CalibError
 from calib.models import example_csv
-from calib.report.compared import plan_comparison, stated_again
+from calib.report.comparison import StatedComparison, plan_comparison
 from calib.report.sections import work_out
 from calib.report.study_tasks import HoldOut, plan_tasks
 from calib.report.writer import file_hashes
@@ -35,7 +35,7 @@ def untouched(tmp_path_factory: pytest.TempPathFactory) -> Path:
     tasks = plan_tasks([table], HoldOut("plate_width_mm", 80.0))
     section = plan_comparison(tasks, MODELS, {})
     found = work_out(tasks, 2019, settings=made.SETTINGS, sections=[section])
-    return made.write(found.study, folder / "report", sections=found.found)
+    return made.write(found, folder / "report")
 
 
 def seal(folder: Path) -> None:
@@ -121,4 +121,4 @@ def test_what_cannot_be_compared_in_a_report_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CalibError, match="slip_ratio"):
         plan_comparison(tasks, ["reece", "lyasko"], {})
     with pytest.raises(ValueError, match="no record"):
-        stated_again({"models": {"reece": 1}})
+        StatedComparison.again({"models": {"reece": 1}})

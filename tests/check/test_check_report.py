@@ -58,7 +58,7 @@ def test_the_same_report_of_a_posterior_that_did_not_converge(tmp_path: Path) ->
     tasks = [task for task in he2019_tasks() if task.output == "rut_depth"]
     short = SamplerSettings(steps=40, max_steps=40)
     write_report(
-        work_out(tasks, 3, settings=short).study, tmp_path / "report",
+        work_out(tasks, 3, settings=short), tmp_path / "report",
         settings=short, command=["calib", "report"], title="A report",
     )  # fmt: skip
     outcome = check(tmp_path / "report")

@@ -49,11 +49,11 @@ def all_numbers() -> dict:
         tasks, 2019, settings=SHORT,
         sections=[GapsSection(paper_gaps()[:1]), AuditSection(Seeds(1, 1, 1))],
     )  # fmt: skip
-    gaps, audit = found.found
+    (gaps, diagnosed), (_, audit) = found.parts
     return {
         "models": summarise(found.study)["models"],
-        "gaps": gaps.summary(),
-        "audit": json.loads(audit_json(audit.audit)),
+        "gaps": gaps.summary(diagnosed),
+        "audit": json.loads(audit_json(audit)),
     }
 
 
@@ -108,9 +108,7 @@ def test_two_workers_make_the_same_report(tmp_path: Path) -> None:
         found = work_out([Task(task.output, task.model, table)], 1, settings=SHORT, workers=workers)
         assert found.study.successes["bulk_density"].validation.refitted
         out = tmp_path / f"report-{workers}"
-        write_report(
-            found.study, out, settings=SHORT, command=["calib", "report"], title="A report"
-        )
+        write_report(found, out, settings=SHORT, command=["calib", "report"], title="A report")
         hashes.append(file_hashes(out))
     assert hashes[0] == hashes[1]
 

@@ -16,9 +16,8 @@ from calib.he2019.audit import Basis, Quantity, Seeds, Verdict, audit_csv, audit
 from calib.he2019.audit.finding import percent
 from calib.he2019.figures import audit_plates
 from calib.he2019.published import PUBLISHED
-from calib.he2019.sections import AUDIT_MARKS, audit_section, write_audit_page
+from calib.he2019.sections import AUDIT_MARKS, AuditSection, audit_section, write_audit_page
 from calib.report.figures.plate import Plate
-from calib.report.sections import Written
 from tests.browser import faults
 from tests.he2019.altered import flipped, printed_figures
 from tests.report.page.test_page import PNG, Reader, page
@@ -228,9 +227,7 @@ def test_the_page_stands_alone(audit, written):
 
 
 def test_the_section_fits_into_the_report(rut, section):
-    html, reader = page(
-        {"rut_depth": rut}, more=[Written("audit", "Audit of the published tables", "", section)]
-    )
+    html, reader = page({"rut_depth": rut}, more=[(AuditSection(), section)])
     assert reader.open == []
     assert len(reader.ids) == len(set(reader.ids))
     assert "#audit" in reader.addresses
@@ -238,7 +235,7 @@ def test_the_section_fits_into_the_report(rut, section):
 
 
 def test_without_an_audit_there_is_no_section(plate):
-    _, reader = page({"rut_depth": plate}, reconstructed=False)
+    _, reader = page({"rut_depth": plate})
     assert "audit" not in reader.ids
 
 

@@ -36,7 +36,7 @@ from calib.he2019.gaps import (
     write_cases,
 )
 from calib.he2019.published import PUBLISHED
-from calib.he2019.sections import FoundGaps, _withheld, check_text
+from calib.he2019.sections import GapsSection, _withheld, check_text
 from calib.inference.calibration import calibrate
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import get_model
@@ -44,6 +44,7 @@ from calib.models.bekker import rut_depth as eq_21
 from calib.models.magic_formula import magic_formula
 from calib.report.gap_facts import output_rows, short_name
 from calib.report.labels import odds_text, short
+from calib.report.sections import Report
 from calib.report.study import Study
 from calib.report.writer import file_hashes, write_report
 from tests.browser import faults
@@ -360,9 +361,10 @@ NOTHING = Study({}, 2019, 0.0)
 
 def written(folder: Path, gaps) -> Path:
     """Write a report of nothing but gaps."""
+    parts = ((GapsSection(), tuple(gaps)),) if gaps else ()
     write_report(
-        NOTHING, folder, settings=SamplerSettings(), command=["calib", "report"],
-        title="Report", sections=[FoundGaps(tuple(gaps))] if gaps else (),
+        Report(NOTHING, parts), folder, settings=SamplerSettings(), command=["calib", "report"],
+        title="Report",
     )  # fmt: skip
     return folder
 
@@ -463,8 +465,8 @@ def test_without_gaps_there_is_no_section(tmp_path):
 def test_a_report_with_gaps_is_replaced_on_request(tmp_path, found_gaps):
     folder = written(tmp_path / "report", [found_gaps["plain_bekker"]])
     write_report(
-        NOTHING, folder, settings=SamplerSettings(), command=["calib", "report"], title="Again",
-        overwrite=True,
+        Report(NOTHING), folder, settings=SamplerSettings(), command=["calib", "report"],
+        title="Again", overwrite=True,
     )  # fmt: skip
     assert not (folder / "gaps").exists()
 

@@ -38,12 +38,11 @@ def test_processes_make_the_same_report_as_one(tmp_path: Path) -> None:
                 settings=SHORT,
                 progress=tell,
                 pool=side,
-                draw=workers > 1,  # as soon as there are outputs, or when they are written
                 sections=[GapsSection(gaps), AuditSection(Seeds(1, 1, 2))],
             )
             write_report(
-                found.study, tmp_path / f"{workers}", settings=SHORT, command=["calib"], title="R",
-                sections=found.found, drawn=found.drawn, progress=tell, pool=side,
+                found, tmp_path / f"{workers}", settings=SHORT, command=["calib"], title="R",
+                progress=tell, pool=side,
             )  # fmt: skip
     one, two = (file_hashes(tmp_path / f"{workers}") for workers in (1, 2))
     assert one == two

@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 
-from calib.batch.pool import HERE
-from calib.report.sections import SECTIONS, EmulatorSection, coverage_words, emulation_words
+from calib.report.sections import SECTIONS, EmulatorSection, Target, coverage_words, emulation_words
 
 GOOD: dict[str, Any] = {
     "runs": 60, "nodes": 12, "between_nodes_error_in_noise_sds": 0.0123, "simulator_noise_sd": 0.0,
@@ -45,27 +44,22 @@ class Tables(HTMLParser):
 
     def handle_data(self, data: str) -> None:
         if self.lasttag in ("td", "th"):
-            self.tables[-1][-1][-1] += data
-
-
-def section(documents: dict[str, dict[str, Any]]) -> Any:
-    return EmulatorSection(documents).begin(1, HERE)(None, None)
+            self.tables[-1][-1][-1] += data.strip()
 
 
 def test_emulators_and_failed_runs_are_listed() -> None:
-    found = section({"good": GOOD, "bad": BAD})
-    written = found.begin(Path(), versions={}, pdf=False, pool=HERE)(None)
-    assert written.anchor == "emulators"
-    emulators, failed = Tables(written.html).tables
+    documents = {"good": GOOD, "bad": BAD}
+    html = EmulatorSection(documents).view(documents, Target(Path(), {}))
+    emulators, failed = Tables(html).tables
     assert emulators[1:] == [
         ["good", "60", "12", "0.0456 on 20",
          "95 % (95 % interval 62 to 100 %): as they should be", "40 %, 20 %, 0 %, 40 %",
          "0.0123", "none", "good enough"],
         ["bad", "60", "12", "none left", "", "none", "0.0123", "0.300", "too few runs; too coarse"],
     ]  # fmt: skip
-    assert "25 runs of bad failed" in written.html
-    assert "The first 20:" in written.html
-    assert "<no>" not in written.html
+    assert "25 runs of bad failed" in html
+    assert "The first 20:" in html
+    assert "<no>" not in html
     assert failed[1:] == [["1, 2.5e+06", "exit", f"exit code {i}", "<no> mesh"] for i in range(20)]
 
 
@@ -89,10 +83,10 @@ def test_a_verdict_says_what_stood_in_for_a_simulator() -> None:
 
 
 def test_the_record_makes_the_section_again() -> None:
-    found = section({"bad": BAD})
-    assert found.summary() is None
+    found = EmulatorSection({"bad": BAD})
+    assert found.summary(found.documents) is None
     again = SECTIONS.get("emulators").again
-    assert again(found.record()) == EmulatorSection({"bad": BAD})
+    assert again(found.record(found.documents)) == EmulatorSection({"bad": BAD})
     for none in (None, [], {"bad": 3}):
         with pytest.raises(ValueError, match="no record"):
             again(none)

@@ -13,6 +13,7 @@ from PIL import Image
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.figures.collect import plates
 from calib.report.publish import publication
+from calib.report.sections import Report
 from calib.report.study import Study
 from calib.report.writer import file_hashes, write_report
 from tests.browser import faults
@@ -36,7 +37,7 @@ class Links(HTMLParser):
 
 def write(result, out: Path, **kwargs) -> Path:
     return write_report(
-        Study({"rut_depth": result}, 2019, 1.0), out, settings=SamplerSettings(),
+        Report(Study({"rut_depth": result}, 2019, 1.0)), out, settings=SamplerSettings(),
         command=["calib", "report"], title="Report", **kwargs,
     ).parent  # fmt: skip
 

@@ -6,7 +6,7 @@ import math
 import re
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import PurePath
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy as np
 from markupsafe import Markup
 
 from calib.models import get_model
-from calib.report.figures.plate import Plate
+from calib.report.figures.collect import Drawn
 from calib.report.labels import axis_of, percent, short, units_of
 from calib.report.numbers import TIMES, format_number, format_value
 from calib.report.page.tables import (
@@ -35,7 +35,7 @@ from calib.report.page.template import (
 from calib.report.publish import Publication
 from calib.report.reference import reference_of
 from calib.report.rows import held_table, x_column
-from calib.report.sections import Document, Written, emulation_words
+from calib.report.sections import Document, Section, emulation_words
 from calib.report.study import Failure, OutputResult, Study
 from calib.report.verdict import Evidence, Level, judge_evidence
 
@@ -166,11 +166,10 @@ def failed_section(key: str, failure: Failure) -> dict[str, Any]:
 def section(
     key: str,
     result: OutputResult,
-    plates: Sequence[Plate],
-    images: Mapping[str, bytes],
+    drawn: Drawn | None = None,
     emulation: Document | None = None,
 ) -> dict[str, Any]:
-    """Return everything that is said of an output; images by ``{key}_{plate.name}.png``.
+    """Return everything that is said of an output.
 
     `emulation` is the `Emulation.document` of an emulator that stood in for its simulator.
     """
@@ -210,10 +209,12 @@ def section(
         "validation": validation_facts(result, evidence.effective, evidence.low_coverage_p),
         "validation_title": _validation_title(result),
         "noise": result.preference and prose(result.preference.sentence, ()),
-        "figures": {
-            p.name: picture(p, images.get(f"{key}_{p.name}.png", b""), prose(p.caption, names))
+        "figures": {}
+        if drawn is None
+        else {
+            p.name: picture(p, drawn.files.get(f"{key}_{p.name}.png", b""), prose(p.caption, names))
             | {"alt": p.caption}
-            for p in plates
+            for p in drawn.plates
         },
         "converged": calibration.converged,
     }
@@ -279,27 +280,20 @@ def _data_facts(result: OutputResult) -> list[list[str]]:
 
 def render_page(
     study: Study,
-    plates: Mapping[str, Sequence[Plate]],
-    images: Mapping[str, bytes],
+    drawn: Mapping[str, Drawn],
     *,
     manifest: Mapping[str, Any],
-    title: str,
-    reconstructed: bool,
-    more: Sequence[Written] = (),
+    more: Sequence[tuple[Section[Any], str]] = (),
     paper: Publication | None = None,
 ) -> str:
     """Render the report, which makes no request: style and images are inside.
 
     Parameters
     ----------
-    plates : mapping of str to sequence of Plate
+    drawn : mapping of str to Drawn
         Figures of every output that was worked out.
-    images : mapping of str to bytes
-        PNG files by name, ``{output}_{plate.name}.png``.
-    reconstructed : bool
-        Whether any data were reconstructed from published results.
-    more : sequence of Written
-        Sections after the outputs, as trusted HTML.
+    more : sequence of (Section, str)
+        Sections after the outputs, with their pieces of the page as trusted HTML.
     paper : Publication, optional
         Tables and methods beside the page.
     """
@@ -308,15 +302,15 @@ def render_page(
     for key, result in study.results.items():
         with units_of(result.task.table.header):
             sections.append(
-                section(key, result, plates.get(key, ()), images, emulations.get(result.task.model))
+                section(key, result, drawn.get(key), emulations.get(result.task.model))
                 if isinstance(result, OutputResult)
                 else failed_section(key, result)
             )
     return template("report.html.j2").render(
-        title=title,
+        title=manifest["title"],
         sections=sections,
-        reconstructed=reconstructed,
-        more=[{**asdict(s), "html": Markup(s.html)} for s in more],
+        reconstructed=any(r.task.table.label for r in study.results.values()),
+        more=[(s, Markup(html)) for s, html in more],
         paper=paper if paper is not None and paper.files else None,
         seed=study.seed,
         command=shlex.join(str(part) for part in manifest.get("command", ())),

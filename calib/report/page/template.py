@@ -52,6 +52,7 @@ _FILTERS: dict[str, Callable[..., str]] = {
     "percent": percent,
     "short": short,
     "value": format_value,
+    "number": format_number,
     "known": _known,
     "g": lambda value: f"{value:g}",
     "lower_first": lambda text: text[0].lower() + text[1:],

@@ -14,6 +14,7 @@ from calib.data import read_table
 from calib.he2019.published import HE2019
 from calib.inference.noise import Noise, NoiseChoice
 from calib.models import MODELS, example_csv
+from calib.report.figures.collect import Drawn
 from calib.report.figures.plate import Plate
 from calib.report.labels import units_of
 from calib.report.page.content import failed_section, render_page, repeats_words, validation_facts
@@ -32,7 +33,7 @@ from calib.report.page.template import (
     symbol_html,
     unit_html,
 )
-from calib.report.sections import Written
+from calib.report.sections import EmulatorSection
 from calib.report.study import Failure, Study
 
 PNG = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR\x00\x00\x00\x02\x00\x00\x00\x03\x08\x06\x00\x00\x00rest"
@@ -86,16 +87,13 @@ def test_scores_have_the_unit_of_the_file(drawbar):
 
 
 def page(results, **kwargs) -> tuple[str, Reader]:
-    drawn = {
-        key: [Plate(Figure(), "bands", "Shows that C2 is 5 kN & more.", "Prediction and data"),
-              Plate(None, "corner", "This figure could not be drawn (no luck).")]
-        for key in results
-    }  # fmt: skip
-    images = {f"{key}_bands.png": PNG for key in results}
-    html = render_page(
-        Study(results, 42, 3.2), drawn, images, manifest=MANIFEST, title="A <title>",
-        reconstructed=kwargs.pop("reconstructed", True), **kwargs,
-    )  # fmt: skip
+    plates = (
+        Plate(Figure(), "bands", "Shows that C2 is 5 kN & more.", "Prediction and data"),
+        Plate(None, "corner", "This figure could not be drawn (no luck)."),
+    )
+    drawn = {key: Drawn(plates, {f"{key}_bands.png": PNG}) for key in results}
+    manifest = {**MANIFEST, "title": "A <title>"}
+    html = render_page(Study(results, 42, 3.2), drawn, manifest=manifest, **kwargs)
     reader = Reader()
     reader.feed(html)
     return html, reader
@@ -152,7 +150,7 @@ def test_reconstructed_data_are_called_so_everywhere(whole):
 
 
 def test_measured_data_are_not_called_reconstructed(plate):
-    html, reader = page({"rut_depth": plate}, reconstructed=False)
+    html, reader = page({"rut_depth": plate})
     assert "econstructed" not in html
     assert "Table 6" not in reader.text
 
@@ -256,10 +254,10 @@ def test_the_footer_says_how_to_get_the_same_numbers(whole):
 
 def test_a_section_is_placed_as_given(rut):
     html, reader = page(
-        {"rut_depth": rut}, more=[Written("audit", "Audit", "new", "<p>All <b>agree</b>.</p>")]
+        {"rut_depth": rut}, more=[(EmulatorSection({}), "<p>All <b>agree</b>.</p>")]
     )
     assert "<p>All <b>agree</b>.</p>" in html
-    assert "audit" in reader.ids
+    assert "emulators" in reader.ids
 
 
 def test_posterior_table_marks_what_the_prior_sets(drawbar):
