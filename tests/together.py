@@ -20,7 +20,7 @@ GROUPS = (
     ("report/figures/test_print.py", "report/figures/test_plates.py", "report/test_writer.py",
      "report/test_verdict.py", "report/test_posterior_text.py", "report/page/test_page.py",
      "report/page/test_in_browser.py", "report/publish/", "inference/test_calibration.py",
-     "inference/test_io.py", "inference/test_netcdf.py", "validation/test_prediction.py",
+     "inference/test_io.py", "validation/test_prediction.py",
      "validation/test_residuals.py", "validation/test_sensitivity.py",
      "validation/test_validate.py", "validation/test_montecarlo.py", "check/test_montecarlo.py",
      "cli/test_audit.py", "cli/test_compare.py", "cli/test_paper_gaps.py",

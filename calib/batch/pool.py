@@ -38,7 +38,7 @@ _SERVING = Lock()
 # What a report needs, and what its figures and files import when they are first made.
 _REPORT = (
     "calib.report.sections", "calib.report.writer", "calib.report.figures.collect",
-    "calib.gap.diagnose", "calib.inference.sampling.walkers", "calib.inference.diagnostics",
+    "calib.gap.diagnose", "calib.inference.sampling.sampler", "calib.inference.diagnostics",
     "scipy.fft", "h5netcdf", "PIL.Image",
 )  # fmt: skip
 

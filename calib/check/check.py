@@ -33,9 +33,8 @@ from calib.data import has_rows, read_table
 from calib.data.files import inside, read_json
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
-from calib.inference.again import estimate_again, recompute_run
 from calib.inference.calibration import Calibration
-from calib.inference.io import describe_estimates, run_problem
+from calib.inference.io import describe_estimates, estimate_again, recompute_run, run_problem
 from calib.inference.problem import Problem, build_problem
 from calib.inference.record import DATA, POSTERIOR, PRIORS, RUN, Record, RunRecord, read_record
 from calib.models import get_model

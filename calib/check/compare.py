@@ -450,17 +450,16 @@ def _posterior(name: str, recorded: Path, drawn: Path) -> Item:
 
 def _groups(path: Path) -> dict[str, Array]:
     """Read every variable of a file by its path; of drawn ones, median and sd by row."""
-    groups = read_netcdf(path)
     found: dict[str, Array] = {}
-    for group, variables in groups.values.items():
-        for name, values in variables.items():
-            x = values.astype(np.float64)
-            if x.ndim >= 2 and groups.dims_of(group, name)[:2] == DRAWN:
+    for node in read_netcdf(path).leaves:
+        for name, variable in node.data_vars.items():
+            x = variable.to_numpy().astype(np.float64)
+            if variable.dims[:2] == DRAWN:
                 draws = x.reshape(x.shape[0] * x.shape[1], -1)
                 # Whatever their tails.
                 low, median, high = np.quantile(draws, [0.16, 0.5, 0.84], axis=0)
                 x = np.stack([median, 0.5 * (high - low)])
-            found[f"{group}/{name}"] = x
+            found[f"{node.name}/{name}"] = x
     return found
 
 

@@ -16,10 +16,9 @@ from calib.inference.prior_files import (
     PriorFile,
     declared_priors,
     default_priors,
-    prior_references,
     read_priors,
 )
-from calib.inference.priors import Priors
+from calib.inference.priors import Priors, prior_references
 
 type ShiftAs = Literal["alone", "soil"]
 type Setting = Literal["pressure", "speed", "passes", "water"]

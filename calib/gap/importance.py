@@ -43,8 +43,7 @@ from calib.gap.fit import Fit
 from calib.gap.forward import Departed
 from calib.gap.gauss_newton import Residuals
 from calib.inference.random import generator
-from calib.inference.sampling.mixture import StudentT, log_sum
-from calib.inference.sampling.proposal import tempered_moments
+from calib.inference.sampling.proposal import StudentT, log_sum, tempered_moments
 from calib.models.base import Array
 
 # Draws whose predictions stay in the processor's cache; more at once take twice as long each.

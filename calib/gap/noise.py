@@ -13,7 +13,7 @@ from scipy.special import gammaln
 from calib.data import Table
 from calib.data.quantities import columns_of
 from calib.gap.effects import View
-from calib.inference.sampling.mixture import log_sum
+from calib.inference.sampling.proposal import log_sum
 from calib.models.base import Array
 
 # Growth of the noise with slip: sigma (1 + rho s), and the prior probability of each.

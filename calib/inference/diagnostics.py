@@ -1,7 +1,6 @@
 """Statistics of chains, by ArviZ and emcee, and the gate a posterior passes before it is shown.
 
-ArviZ is imported late. Ranks, most of the work, are found here, once for R-hat and bulk ESS alike;
-emcee's autocorrelation time is worked out for all walkers at once.
+ArviZ is imported late.
 """
 
 from __future__ import annotations
@@ -11,14 +10,11 @@ from importlib import import_module
 from typing import Any, Literal
 
 import numpy as np
-from scipy.special import ndtri
 
 from calib.data.files import plain_number
 from calib.models.base import Array
 
 _AXES = {"chain_axis": 0, "draw_axis": 1}
-# Autocorrelation times that are summed over.
-_WINDOW = 5.0
 
 
 def _stats() -> Any:
@@ -39,76 +35,38 @@ def convergence(draws: Array) -> Convergence:
     """Judge draws of ensembles, shape (ensembles, walkers, steps, d); NaN of fewer than four steps.
 
     Walkers of one ensemble are not independent chains, so R-hat compares whole ensembles: each is
-    one chain, its halves the earlier and the later steps, without the first of an odd number.
-    Effective sample sizes take each walker as a chain, for autocorrelation runs along its steps.
+    one chain, its halves the earlier and the later steps. Effective sample sizes take each walker
+    as a chain, for autocorrelation runs along its steps.
 
     References
     ----------
     Vehtari et al. (2021), doi:10.1214/20-BA1221.
     """
     ensembles, walkers, steps, d = draws.shape
-    half = steps // 2
-    by_half = draws[:, :, steps - 2 * half :].reshape(ensembles, walkers, 2, half, d)
-    found = np.full((3, d), np.nan)
-    for j in range(d):
-        x = by_half[..., j]
-        if half > 1 and np.isfinite(x).all():
-            found[:, j] = _convergence_of(np.ascontiguousarray(x))
-    return Convergence(*found)
-
-
-def _convergence_of(x: Array) -> tuple[float, float, float]:
-    """R-hat, bulk and tail ESS of one parameter, shape (ensembles, walkers, 2, half)."""
-    ensembles, walkers, _, half = x.shape
-    scores = _normal_scores(x)
-    folded = _normal_scores(abs(x - np.median(x)))
-    stats = _stats()
+    if steps < 4:
+        return Convergence(*np.full((3, d), np.nan))
+    by_step = draws[:, :, steps % 2 :].swapaxes(1, 2).reshape(ensembles, -1, d)
+    chains = draws.reshape(ensembles * walkers, steps, d)
     with np.errstate(all="ignore"):
-        rhats = [
-            stats.rhat(
-                v.swapaxes(1, 2).reshape(2 * ensembles, walkers * half), method="identity", **_AXES
-            )
-            for v in (scores, folded)
-        ]
-        bulk = stats.ess(scores.reshape(-1, half), method="identity", **_AXES)
-    tail = ess(x.reshape(ensembles * walkers, 2 * half, 1), "tail")[0]
-    return float(np.maximum(*rhats)), float(bulk), float(tail)
+        rhat = np.asarray(_stats().rhat(by_step, method="rank", **_AXES))
+    return Convergence(rhat, ess(chains, "bulk"), ess(chains, "tail"))
 
 
-def _normal_scores(x: Array) -> Array:
-    """Normal quantiles of the pooled ranks, ties averaged, of any shape (Blom 1958)."""
-    flat = x.ravel()
-    order = flat.argsort()
-    ordered = flat[order]
-    first = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
-    behind = np.append(first[1:], flat.size)
-    rank = 0.5 * (first + 1 + behind)
-    scores = np.empty(flat.size)
-    scores[order] = np.repeat(ndtri((rank - 0.375) / (flat.size + 0.25)), behind - first)
-    return scores.reshape(x.shape)
+def longest_autocorrelation_time(chain: Array) -> Array:
+    """Integrated autocorrelation times in steps of a chain (steps, walkers, d), shape (d,).
 
-
-def autocorrelation_time(chain: Array) -> Array:
-    """Integrated autocorrelation time in steps, shape (walkers, steps, d) to (d,), as emcee's.
-
-    The window is the first that spans five of them (Sokal). NaN if a walker never moved.
+    By emcee, of 64 evenly picked walkers: the larger of a coordinate's own and that of its distance
+    from its median. A walker that goes to and fro between two modes has little autocorrelation of
+    its own to show. Infinite if a walker never moved.
     """
-    from scipy.fft import irfft, next_fast_len, rfft  # late: a quarter of a second
+    from emcee.autocorr import integrated_time  # late: half a second
 
-    _, steps, d = chain.shape
-    size = next_fast_len(2 * steps, real=True)
-    tau = np.empty(d)
-    for j in range(d):
-        x = chain[..., j] - chain[..., j].mean(axis=1, keepdims=True)
-        spectrum = rfft(x, n=size, axis=1)
-        covariance = irfft(spectrum.real**2 + spectrum.imag**2, n=size, axis=1)[:, :steps]
-        # Of a walker that never moved, what the mean leaves is rounding.
-        covariance[np.ptp(chain[..., j], axis=1) == 0.0] = 0.0
-        with np.errstate(invalid="ignore"):
-            taus = 2.0 * np.cumsum((covariance / covariance[:, :1]).mean(axis=0)) - 1.0
-        # The sum over all lags is zero, so that the window ends; without a time all are NaN.
-        tau[j] = taus[(np.arange(steps) < _WINDOW * taus).argmin()]
-    return tau
+    some = chain[:, :: max(1, chain.shape[1] // 64)]
+    both = np.concatenate([some, abs(some - np.median(some, axis=(0, 1)))], axis=2)
+    with np.errstate(invalid="ignore"):
+        tau = integrated_time(both, c=5, tol=0, quiet=True).reshape(2, -1).max(axis=0)
+    moved = (np.ptp(some, axis=0) > 0.0).all(axis=0)
+    return np.where(moved & np.isfinite(tau), np.maximum(tau, 1.0), np.inf)
 
 
 def ess(chains: Array, method: Literal["bulk", "tail", "mean"]) -> Array:

@@ -1,34 +1,237 @@
-"""Prior files: TOML read, checked against the model, and turned into priors."""
+"""Prior files: TOML read, checked entry by entry and against the model, and turned into priors."""
 
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from scipy.special import digamma, polygamma
 
 from calib.batch.plugins import declared_in
 from calib.data.files import MEND_TOML, read_text
+from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError, in_words, meant
-from calib.inference.noise import USUAL, NoiseChoice
-from calib.inference.prior_entries import (
-    NOISE_ENTRIES,
-    LikelihoodTable,
-    PriorFileContent,
-    explain,
-    likeliest,
-    no_such_key,
-    prior_of,
-)
+from calib.inference.noise import DEFAULT_PRIORS, USUAL, Along, Family, NoiseChoice
 from calib.inference.priors import Prior, Priors
 from calib.models import MODELS
+
+# Beyond these, squares and products of numbers leave the range of double precision; no quantity of
+# the field comes near them. An sd of 20 on the logarithm is a factor of 5e8 to either side.
+_Number = Annotated[float, Field(strict=True, ge=-1e15, le=1e15)]
+_Positive = Annotated[float, Field(strict=True, gt=1e-15, le=1e15)]
+_LogSd = Annotated[float, Field(strict=True, gt=1e-6, le=20.0)]
+
+
+class _Entry(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    unit: str
+    reason: str = Field(min_length=1)
+    source: str = Field(min_length=1)
+    relative_to: str | None = None
+    default_reference: _Positive = 1.0
+
+
+class _Bounded(_Entry):
+    lower: _Number | None = None
+    upper: _Number | None = None
+
+
+class _OnLogarithm(_Entry):
+    lower: _Positive | None = None
+    upper: _Positive | None = None
+
+
+class _Normal(_Bounded):
+    dist: Literal["normal"]
+    mean: _Number
+    sd: _Positive
+
+
+class _LogNormal(_OnLogarithm):
+    dist: Literal["lognormal"]
+    median: _Positive
+    sd_log: _LogSd
+
+
+class _HalfNormal(_Entry):
+    dist: Literal["half_normal"]
+    sd: _Positive
+
+
+class _Uniform(_Entry):
+    dist: Literal["uniform"]
+    lower: _Number
+    upper: _Number
+
+
+class _Gamma(_OnLogarithm):
+    dist: Literal["gamma"]
+    shape: _Positive
+    rate: _Positive
+
+
+class _Fixed(_Entry):
+    dist: Literal["fixed"]
+    value: _Number
+
+
+_DISTS: Mapping[str, type[_Entry]] = {
+    "normal": _Normal, "lognormal": _LogNormal, "half_normal": _HalfNormal, "uniform": _Uniform,
+    "gamma": _Gamma, "fixed": _Fixed,
+}  # fmt: skip
+type PriorEntry = Annotated[
+    _Normal | _LogNormal | _HalfNormal | _Uniform | _Gamma | _Fixed, Field(discriminator="dist")
+]
+
+
+class LikelihoodTable(BaseModel):
+    """The table ``[likelihood]``."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    family: Family = "normal"
+    noise_depends_on: str = ""
+    correlated_along: Along = ""
+
+
+class PriorFileContent(BaseModel):
+    """A whole prior file."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    model: str
+    likelihood: LikelihoodTable = LikelihoodTable()
+    parameters: dict[str, PriorEntry]
+
+
+NOISE_ENTRIES = TypeAdapter(dict[str, PriorEntry]).validate_python(tomllib.loads(DEFAULT_PRIORS))
+
+
+def prior_of(name: str, entry: PriorEntry, source: str, references: Mapping[str, float]) -> Prior:
+    """Return the prior that an entry gives; `references` as for `read_priors`.
+
+    Raises
+    ------
+    CalibError
+        If its bounds cross, or it is relative to no known column.
+    """
+    where, known = f"{source}, parameters.{name}", [q.canonical for q in QUANTITIES.values()]
+    reference, text = 1.0, _words(entry)
+    if entry.relative_to is not None:
+        if entry.relative_to not in known:
+            raise CalibError(
+                f"relative_to names no known column: {entry.relative_to!r}",
+                where=where,
+                expected=", ".join(known),
+                hint="name one of these, as the table has it in its own unit",
+            )
+        reference = references.get(entry.relative_to, entry.default_reference)
+        text += f" x {reference:g} ({entry.relative_to})"
+    loc, scale, lower, upper = _internal(entry, reference)
+    gamma = (entry.shape, entry.rate) if isinstance(entry, _Gamma) else None
+    if gamma is not None and name != "nu":
+        found = 'dist = "gamma" is for the degrees of freedom nu of a Student-t likelihood'
+        expected = "normal, lognormal, half_normal, uniform or fixed"
+        raise CalibError(found, where=where, expected=expected, hint="choose one of these")
+    if not lower < upper:
+        found = f"lower bound {lower:g} is not below upper bound {upper:g}"
+        raise CalibError(found, where=where, hint="give lower < upper")
+    most_sds = 1e4  # farther out the quantiles of a normal lose their digits
+    off = max(lower - loc, loc - upper)
+    if off > most_sds * scale > 0.0:
+        middle = "median" if isinstance(entry, _OnLogarithm) else "mean"
+        raise CalibError(
+            f"the bounds lie {off / scale:.3g} sds from the {middle}",
+            where=where,
+            expected=f"bounds within {most_sds:g} sds, and better those that hold some of the "
+            "distribution",
+            hint="correct the bounds, or the distribution",
+        )
+    return Prior(
+        name, entry.unit, entry.reason, entry.source, text, isinstance(entry, _OnLogarithm), loc,
+        scale, lower, upper, gamma,
+    )  # fmt: skip
+
+
+def _internal(entry: PriorEntry, reference: float) -> tuple[float, float, float, float]:
+    """Return (loc, scale, lower, upper) of an entry in internal coordinates."""
+    low, high = getattr(entry, "lower", None), getattr(entry, "upper", None)
+    if isinstance(entry, _OnLogarithm):
+        reference = 1.0 if isinstance(entry, _Gamma) else reference
+        low, high = (x and float(np.log(x * reference)) for x in (low, high))
+    else:
+        low, high = (x if x is None else x * reference for x in (low, high))
+    low, high = -np.inf if low is None else low, np.inf if high is None else high
+    match entry:
+        case _Normal(mean=mean, sd=sd):
+            return mean * reference, sd * reference, low, high
+        case _LogNormal(median=median, sd_log=sd_log):
+            return float(np.log(median * reference)), sd_log, low, high
+        case _HalfNormal(sd=sd):
+            return 0.0, sd * reference, 0.0, high
+        case _Uniform():
+            return 0.5 * (low + high), np.inf, low, high
+        case _Gamma(shape=shape, rate=rate):
+            mean, variance = float(digamma(shape) - np.log(rate)), float(polygamma(1, shape))
+            return mean, float(np.sqrt(variance)), low, high
+        case _Fixed(value=value):
+            return value * reference, 0.0, low, high
+
+
+def _words(entry: PriorEntry) -> str:
+    """Write an entry as its distribution with its numbers, and its bounds if there are any."""
+    own = {name: value for name, value in entry if name not in _Entry.model_fields}
+    dist = own.pop("dist")
+    low, high = None, None
+    if dist != "uniform":
+        low, high = own.pop("lower", None), own.pop("upper", None)
+    text = f"{dist}({', '.join(f'{value:g}' for value in own.values())})"
+    if low is None and high is None:
+        return text
+    return f"{text} on [{-np.inf if low is None else low:g}, {np.inf if high is None else high:g}]"
+
+
+def _likeliest(error: ValidationError) -> Any:
+    """Return the error to tell: of a misspelt key, by which another is missing, its name."""
+    errors = error.errors()
+    return next((e for e in errors if e["type"] == "extra_forbidden"), errors[0])
+
+
+def _no_such_key(key: object, known: Iterable[str], where: str) -> CalibError:
+    """Return the refusal of a key that is not `known`."""
+    return CalibError(
+        f"there is no key {str(key)!r}", where=where, expected=", ".join(known),
+        hint=meant(str(key), known, "correct it, or take it out"),
+    )  # fmt: skip
+
+
+def _explain(error: ValidationError, source: str) -> CalibError:
+    """Return what pydantic found in a prior file as this package says it."""
+    first = _likeliest(error)
+    place = [str(part) for part in first["loc"]]
+    found, where = in_words(first), f"{source}, {'.'.join(place)}"
+    expected, hint = (
+        "dist = normal (mean, sd > 0), lognormal (median > 0, sd_log > 0), half_normal (sd > 0), "
+        "uniform (lower < upper) or fixed (value); of nu also gamma (shape > 0, rate > 0); each "
+        "with unit, reason, source",
+        "correct this entry",
+    )
+    if first["type"] == "extra_forbidden" and place[0] == "parameters":
+        _, name, dist, key = place
+        return _no_such_key(key, _DISTS[dist].model_fields, f"{source}, parameters.{name}")
+    if first["type"].startswith("union_tag"):
+        dist = first["input"].get("dist")
+        found = "there is no dist" if dist is None else f"there is no distribution {dist!r}"
+        expected, hint = ", ".join(_DISTS), meant(str(dist), _DISTS, "choose one of these")
+    elif first["type"] == "float_type":
+        where = f"{source}, parameters.{place[1]}"
+        expected, hint = f"a number, as in {place[-1]} = 0.75", "write a number without quotes"
+    return CalibError(found, where=where, expected=expected, hint=hint)
 
 
 @dataclass(frozen=True)
@@ -93,12 +296,11 @@ def prior_file_model(path: Path) -> str:
     """
     model = _content(_text(Path(path)), str(path)).get("model")
     if not isinstance(model, str):
-        raise CalibError(
+        found, hint = (
             "the prior file does not say which model it is for",
-            where=str(path),
-            expected='model = "NAME"',
-            hint="add this line at its top",
+            "add this line at its top",
         )
+        raise CalibError(found, where=str(path), expected='model = "NAME"', hint=hint)
     return model
 
 
@@ -133,36 +335,23 @@ def _text(path: PriorFile) -> str:
     try:
         return read_text(path)
     except (OSError, UnicodeDecodeError) as error:
-        raise CalibError(
-            f"the prior file cannot be read ({error})",
-            where=str(path),
-            hint="give the path of a readable TOML file",
-        ) from None
+        found = f"the prior file cannot be read ({error})"
+        hint = "give the path of a readable TOML file"
+        raise CalibError(found, where=str(path), hint=hint) from None
 
 
 def _content(text: str, source: str) -> dict[str, Any]:
     try:
         return _parsed(text)
     except tomllib.TOMLDecodeError as error:
-        raise CalibError(
-            f"the prior file is not valid TOML: {error}", where=source, hint=MEND_TOML
-        ) from None
+        found = f"the prior file is not valid TOML: {error}"
+        raise CalibError(found, where=source, hint=MEND_TOML) from None
 
 
 @lru_cache(maxsize=64)
 def _parsed(text: str) -> dict[str, Any]:
     """What a text says, which a diagnosis asks of the same few again and again; not to change."""
     return tomllib.loads(text)
-
-
-def prior_references(columns: Mapping[str, NDArray[np.float64]]) -> dict[str, float]:
-    """Return the scales that priors may be relative to: medians of columns (n,), where positive."""
-    medians = {
-        name: float(np.median(values[np.isfinite(values)]))
-        for name, values in columns.items()
-        if np.isfinite(values).any()
-    }
-    return {name: median for name, median in medians.items() if median > 0.0}
 
 
 def relative_columns(text: str) -> dict[str, float]:
@@ -186,13 +375,13 @@ def parse_priors(
     content = _content(text, source)
     # A misspelt name is reported before its content: it is the likelier mistake.
     if unknown := [key for key in content if key not in PriorFileContent.model_fields]:
-        raise no_such_key(unknown[0], PriorFileContent.model_fields, source)
+        raise _no_such_key(unknown[0], PriorFileContent.model_fields, source)
     noise = _noise_choice(content, source, parameters)
     _check_names(content, source, model_name, parameters, noise.parameters)
     try:
         file = PriorFileContent.model_validate(content)
     except ValidationError as error:
-        raise explain(error, source) from None
+        raise _explain(error, source) from None
     _check_units(file, source, model_name)
     given = NOISE_ENTRIES | file.parameters
     names = (*parameters[:-1], *noise.parameters, *parameters[-1:])
@@ -234,9 +423,9 @@ def _noise_choice(
     try:
         chosen = LikelihoodTable.model_validate(content["likelihood"])
     except ValidationError as error:
-        first = likeliest(error)
+        first = _likeliest(error)
         if first["type"] == "extra_forbidden":
-            raise no_such_key(first["loc"][-1], LikelihoodTable.model_fields, where) from None
+            raise _no_such_key(first["loc"][-1], LikelihoodTable.model_fields, where) from None
         raise CalibError(
             in_words(first), where=where,
             expected='family = "normal" or "student_t", noise_depends_on = "slip" or another '
@@ -274,26 +463,19 @@ def _check_names(
     unknown = [name for name in given if name not in (*parameters, *of_noise)]
     missing = [name for name in parameters if name not in given]
     if unknown or missing:
-        found = "; ".join(
-            f"{what} {', '.join(names)}"
-            for what, names in (("unknown parameter", unknown), ("missing parameter", missing))
-            if names
-        )
-        guesses = "".join(
-            f"{name}: {guess} " for name in unknown if (guess := meant(name, missing, ""))
-        )
+        kinds = (("unknown parameter", unknown), ("missing parameter", missing))
+        found = "; ".join(f"{what} {', '.join(names)}" for what, names in kinds if names)
+        meanings = ((name, meant(name, missing, "")) for name in unknown)
+        guesses = "".join(f"{name}: {guess} " for name, guess in meanings if guess)
+        shipped = default_priors(model_name)
+        there = isinstance(shipped, Path) and shipped.is_file()
+        copy = "; copy the shipped file and edit it" if there else ""
         raise CalibError(
             found,
             where=f"{source}, [parameters]",
             expected=", ".join(parameters),
-            hint=f"{guesses}give exactly these parameters{_example(model_name)}",
+            hint=f"{guesses}give exactly these parameters{copy}",
         )
-
-
-def _example(model_name: str) -> str:
-    shipped = default_priors(model_name)
-    there = isinstance(shipped, Path) and shipped.is_file()
-    return "; copy the shipped file and edit it" if there else ""
 
 
 def _check_units(file: PriorFileContent, source: str, model_name: str) -> None:

@@ -60,6 +60,16 @@ class Prior:
         return self.scale == 0.0
 
 
+def prior_references(columns: Mapping[str, NDArray[np.float64]]) -> dict[str, float]:
+    """Return the scales that priors may be relative to: medians of columns (n,), where positive."""
+    medians = {
+        name: float(np.median(values[np.isfinite(values)]))
+        for name, values in columns.items()
+        if np.isfinite(values).any()
+    }
+    return {name: median for name, median in medians.items() if median > 0.0}
+
+
 def _in_tail(a: Array, b: Array, u: Array) -> Array:
     """Quantiles (k, d) of standard normals between bounds (d,) far below zero."""
     with np.errstate(divide="ignore", under="ignore"):
@@ -220,3 +230,84 @@ class Priors:
             self.source,
             self.noise,
         )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class SumAndRatio(Priors):
+    """The same priors in other coordinates: of two logarithms a and b, ln(e^a + c e^b) and b - a.
+
+    The posterior is then nearly normal where data determine only the sum and that of a and b is a
+    bent ridge. The Jacobian is one, so densities are unchanged.
+
+    Parameters
+    ----------
+    first, second : int
+        Places of a and b among the free parameters.
+    ln_times : float
+        ln c.
+    """
+
+    first: int = 0
+    second: int = 1
+    ln_times: float = 0.0
+
+    def joined(self, t: Array) -> Array:
+        """Return coordinates (..., d) of those by parameter."""
+        u = np.array(t)
+        b = t[..., self.second] + self.ln_times
+        u[..., self.first] = np.logaddexp(t[..., self.first], b)
+        u[..., self.second] = b - t[..., self.first]
+        return u
+
+    def by_parameter(self, u: Array) -> Array:
+        """Invert `joined`."""
+        t = np.array(u)
+        t[..., self.first] -= np.logaddexp(0.0, u[..., self.second])
+        t[..., self.second] += t[..., self.first] - self.ln_times
+        return t
+
+    def log_prob(self, t: Array) -> Array:
+        """As of `Priors`."""
+        return super().log_prob(self.by_parameter(t))
+
+    def ppf(self, u: Array) -> Array:
+        """As of `Priors`."""
+        return self.joined(super().ppf(u))
+
+    def to_natural(self, t: Array) -> Array:
+        """As of `Priors`."""
+        return super().to_natural(self.by_parameter(np.atleast_2d(t)))
+
+    def to_internal(self, natural: Array, margin: float = 1e-9) -> Array:
+        """As of `Priors`."""
+        return self.joined(super().to_internal(natural, margin))
+
+
+def sum_and_ratio(
+    priors: Priors, joined: tuple[str, str, str] | None, conditions: Mapping[str, Array]
+) -> Priors:
+    """Return priors in coordinates to sample in, if a model joins two of its parameters.
+
+    Parameters
+    ----------
+    joined : tuple of str, optional
+        Two parameters, and the condition whose mean is c. They need log-normal priors without
+        bounds; with others the priors are returned as they are.
+    """
+    if joined is None or not {*joined[:2]} <= {*priors.names}:
+        return priors
+    *names, condition = joined
+    first, second = (priors.names.index(name) for name in names)
+    for p in (priors.free[first], priors.free[second]):
+        if (
+            not p.log
+            or p.gamma
+            or not np.isfinite(p.scale)
+            or p.lower > -np.inf
+            or p.upper < np.inf
+        ):
+            return priors
+    return SumAndRatio(
+        priors.entries, priors.text, priors.source, priors.noise, first, second,
+        float(np.log(conditions[condition].mean())),
+    )  # fmt: skip

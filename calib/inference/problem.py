@@ -33,11 +33,10 @@ from calib.inference.noise import NORMAL, Noise, Serial, noise_of, serial_of
 from calib.inference.prior_files import (
     PriorFile,
     default_priors,
-    prior_references,
     read_priors,
     relative_columns,
 )
-from calib.inference.priors import Priors
+from calib.inference.priors import Priors, prior_references
 from calib.inference.random import generator
 from calib.models import Array, BoundModel, Conditions, get_model
 from calib.models.simulators.registered import simulated_by

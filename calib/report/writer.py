@@ -15,7 +15,7 @@ from calib.batch.pool import HERE, Pool
 from calib.data import Table, write_table
 from calib.data.files import read_text
 from calib.inference.estimators import GeneticSettings
-from calib.inference.io import groups_of, write_netcdf
+from calib.inference.io import save_posterior
 from calib.inference.prior_files import default_priors
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import get_model
@@ -173,7 +173,7 @@ def _remove_all_but(files: Collection[str], folder: Path) -> None:
 
 def _keep(key: str, result: OutputResult, folder: Path) -> None:
     """Write the posterior of an output."""
-    write_netcdf(groups_of(result.calibration), folder / f"{key}.nc")
+    save_posterior(result.calibration, folder / f"{key}.nc")
 
 
 def own_names(table: Table) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from result_schemas import RESULTS
 
 from calib.batch.campaign.kinds import KINDS
 from calib.check.verify import Manifest
-from calib.inference.prior_entries import json_schema
+from calib.inference.prior_files import PriorFileContent
 from calib.inference.record import RunRecord
 from calib.models.simulators.files import SimulatorFile
 from calib.report.comparison import ComparisonRecord
@@ -17,7 +17,7 @@ from calib.report.comparison import ComparisonRecord
 def schemas() -> dict[str, dict[str, Any]]:
     """Return the schemas by the names of their files."""
     return {
-        "priors": json_schema(),
+        "priors": PriorFileContent.model_json_schema(),
         "plan": _plan(),
         "simulator": SimulatorFile.model_json_schema(),
         "manifest": _without_document(Manifest.model_json_schema()),

@@ -199,15 +199,15 @@ def test_an_interrupted_diagnosis_that_was_made_is_there(monkeypatch: pytest.Mon
 
 
 def test_a_disk_that_is_full_at_the_end_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    usual, asked = calib.inference.io.write_netcdf, list[Path]()
+    usual, asked = calib.inference.io.save_posterior, list[Path]()
 
-    def once(groups: Any, path: Path) -> None:
+    def once(calibration: calib.Calibration, path: Path) -> None:
         asked.append(path)
         if len(asked) == 1:
             fail()
-        usual(groups, path)
+        usual(calibration, path)
 
-    monkeypatch.setattr("calib.inference.io.write_netcdf", once)
+    monkeypatch.setattr("calib.inference.io.save_posterior", once)
     done = run(*FIT)
     assert done.exit_code == 2
     assert "cannot be written (No space left on device)" in done.stderr

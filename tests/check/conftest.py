@@ -24,8 +24,8 @@ from calib.check.check import check, recompute_report
 from calib.check.outcome import Outcome, Status
 from calib.he2019 import sections
 from calib.he2019.audit import begin_audit
-from calib.inference.again import recompute_run
 from calib.inference.calibration import Calibration
+from calib.inference.io import recompute_run
 from calib.report.publish import publication
 from calib.report.writer import file_hashes
 from calib.validation.validate import posterior_errors

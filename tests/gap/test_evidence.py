@@ -18,7 +18,7 @@ from calib.gap.hypotheses import Hypothesis
 from calib.gap.importance import Density, _Pool, refine
 from calib.gap.noise import KAPPA, RHO, Noise, ln_prior
 from calib.inference.priors import Prior
-from calib.inference.sampling.mixture import StudentT
+from calib.inference.sampling.proposal import StudentT
 from tests.gap.fits import averaged_log_joint, lifted, straight_line
 
 

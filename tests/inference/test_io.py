@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 from collections.abc import Callable
@@ -118,7 +119,11 @@ def test_other_programs_find_the_same_figures_in_the_file(
 ) -> None:
     # Not at the top: to import it takes every process of the tests a second.
     import arviz as az
+    import xarray as xr
 
+    tree = to_datatree(rut_calibration)
+    for name, node in io.read_netcdf(saved / "posterior.nc").children.items():
+        xr.testing.assert_equal(node.to_dataset(), tree[name].to_dataset())
     with az.from_netcdf(saved / "posterior.nc", engine="h5netcdf") as tree:
         summary = az.summary(tree, round_to="none")
         loo = az.loo(tree, pointwise=True)
@@ -128,6 +133,17 @@ def test_other_programs_find_the_same_figures_in_the_file(
     ours = leave_one_out(rut_calibration)
     # ArviZ smooths with the relative efficiency of the chains, which moves the tail slightly.
     assert loo.elpd == pytest.approx(ours.elpd, abs=0.05)
+
+
+def test_a_disk_too_small_is_seen_before_it_is_written_to(
+    rut_calibration: Calibration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full = shutil._ntuple_diskusage(10**9, 10**9 - 1000, 1000)  # type: ignore[attr-defined]
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: full)
+    with pytest.raises(OSError, match="No space left") as told:
+        io.save_posterior(rut_calibration, tmp_path / "posterior.nc")
+    assert told.value.errno == errno.ENOSPC
+    assert not any(tmp_path.iterdir())
 
 
 def test_prior_draws_are_of_the_prior(rut_calibration: Calibration) -> None:

@@ -16,11 +16,10 @@ from calib.errors import CalibError
 from calib.inference.prior_files import (
     default_priors,
     parse_priors,
-    prior_references,
     read_priors,
     relative_columns,
 )
-from calib.inference.priors import Prior, Priors
+from calib.inference.priors import Prior, Priors, prior_references
 from calib.models import MODELS
 
 ENTRY = '[parameters.{name}]\nunit = "1"\nreason = "a test"\nsource = "nobody"\n'

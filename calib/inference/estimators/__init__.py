@@ -12,11 +12,8 @@ from calib.batch.threads import one_thread
 from calib.data.registry import Registry
 from calib.errors import CalibError
 from calib.inference.estimators.genetic import GeneticSettings, estimate_genetic, minimise_genetic
-from calib.inference.estimators.search import (
-    PointEstimate,
-    estimate_differential_evolution,
-    estimate_least_squares,
-)
+from calib.inference.estimators.least_squares import estimate_least_squares
+from calib.inference.estimators.search import PointEstimate, estimate_differential_evolution
 from calib.inference.problem import Problem
 from calib.inference.trial import try_simulator
 from calib.models import get_model

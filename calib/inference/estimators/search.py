@@ -1,4 +1,4 @@
-"""Point estimates by search: goodness of fit, the box, least squares, differential evolution.
+"""Point estimates by search: goodness of fit, what is identified, the box, SciPy's evolution.
 
 What the data do not determine is held before anything is fitted. Two inflation pressures leave the
 curvature of a quadratic in pressure free, tests at one ground pressure leave the exponent of
@@ -20,12 +20,10 @@ from scipy.linalg import qr
 
 from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
+from calib.inference.constants import CHUNK_CELLS, FLAT_PART, SHORT_DATA
 from calib.inference.problem import Problem
 from calib.inference.sampling.mode import prior_widths
 from calib.models.base import Array, BoundModel, Conditions
-
-# Rows times vectors evaluated at once: bounds the memory, keeps temporaries in cache.
-_CHUNK_CELLS = 200_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +63,7 @@ def residuals(problem: Problem, natural: Array) -> Array:
     Natural parameters have the noise scale last. NaN where the model has no value.
     """
     k, n = natural.shape[0], problem.response.size
-    at_once = max(1, _CHUNK_CELLS // n)
+    at_once = max(1, CHUNK_CELLS // n)
     if k <= at_once:
         return problem.residuals(natural)
     out = np.empty((k, n))
@@ -120,9 +118,6 @@ def goodness(
     )
 
 
-_SHOWN = 5
-
-
 def check_defined(
     bound: BoundModel, theta: Array, conditions: Conditions, source: str, lines: NDArray[np.int64]
 ) -> None:
@@ -130,34 +125,26 @@ def check_defined(
 
     Parameters are (k, d), conditions and the `lines` of the `source` (n,).
     """
+    shown = 5
     empty = lines[~np.isfinite(bound.mean_response(theta, conditions)).any(axis=0)]
     if empty.size:
         raise CalibError(
             f"the model {bound.model.name} has no value there",
-            where=f"{source}, lines {', '.join(map(str, empty[:_SHOWN]))}"
-            + (f" and {empty.size - _SHOWN} more" if empty.size > _SHOWN else ""),
+            where=f"{source}, lines {', '.join(map(str, empty[:shown]))}"
+            + (f" and {empty.size - shown} more" if empty.size > shown else ""),
             expected="conditions at which the model is defined (see its page in the documentation)",
             hint="leave these rows out, or choose another model",
         )
 
 
-# A parameter is flat if one prior standard deviation of it moves the predictions, as far as the
-# others cannot imitate it, by less than this part of their own scatter.
-_FLAT = 1e-6
-_N_POINTS = 8
-_STEP = 1e-4
-_TAIL = 0.5 * (1.0 - 0.998)
-_MOST_ROWS = 4000
-
-
-def location(problem: Problem) -> Array:
+def prior_location(problem: Problem) -> Array:
     """Prior location (mean or median) inside the bounds, internal, shape (n_dim,)."""
     return np.array([np.clip(p.loc, p.lower, p.upper) for p in problem.priors.free])
 
 
 def central_interval(problem: Problem) -> tuple[Array, Array]:
     """Bounds of the prior's central 99.8 %, internal, each of shape (n_dim,)."""
-    ends = np.repeat([[_TAIL], [1.0 - _TAIL]], problem.n_dim, axis=1)
+    ends = np.repeat([[0.001], [0.999]], problem.n_dim, axis=1)
     low, high = problem.priors.ppf(ends)
     return low, high
 
@@ -168,10 +155,10 @@ def representative_rows(problem: Problem) -> Problem:
     They are enough to find the neighbourhood of the optimum.
     """
     n = len(problem.table)
-    if n <= _MOST_ROWS:
+    if n <= SHORT_DATA:
         return problem
     conditions = list(problem.conditions.values())
-    pick = np.linspace(0, n - 1, _MOST_ROWS // len(conditions)).round().astype(int)
+    pick = np.linspace(0, n - 1, SHORT_DATA // len(conditions)).round().astype(int)
     rows = np.unique(np.concatenate([np.argsort(c, kind="stable")[pick] for c in conditions]))
     return problem.with_table(problem.table.take(rows))
 
@@ -192,35 +179,29 @@ def hold_unidentified(problem: Problem) -> tuple[Problem, tuple[str, ...]]:
     if not flat:
         return problem, ()
     names = tuple(problem.names[j] for j in sorted(flat))
-    natural = problem.theta(location(problem)[None])[0]
+    natural = problem.theta(prior_location(problem)[None])[0]
     values = dict(zip((p.name for p in problem.priors.entries), natural, strict=True))
     return problem.with_fixed({name: float(values[name]) for name in names}), names
 
 
 def _flat_at_points(problem: Problem) -> list[tuple[int, ...]]:
-    d, width, centre = problem.n_dim, prior_widths(problem.priors), location(problem)
-    # A low-discrepancy sequence in the middle of the prior.
+    """Parameters that are flat at the prior's centre and at points in its middle."""
+    d, width, centre = problem.n_dim, prior_widths(problem.priors), prior_location(problem)
+    # A low-discrepancy sequence.
     ratio = (1.0 + np.sqrt(5.0)) / 2.0
-    steps = np.mod(np.outer(np.arange(1, _N_POINTS + 1), ratio ** -np.arange(1, d + 1)), 1.0)
-    points = np.vstack([centre, problem.priors.ppf(0.2 + 0.6 * steps)])
+    steps = np.mod(np.outer(np.arange(1, 9), ratio ** -np.arange(1, d + 1)), 1.0)
     scatter = float(np.linalg.norm(problem.response - problem.response.mean()))
     found = []
-    for point in points:
-        step = _STEP * np.diag(width)
+    for point in np.vstack([centre, problem.priors.ppf(0.2 + 0.6 * steps)]):
+        step = 1e-4 * np.diag(width)
         pairs = problem.theta(np.concatenate([point + step, point - step]))
         ahead, behind = np.split(residuals(problem, pairs), 2)
-        jacobian = ((behind - ahead) / (2.0 * _STEP)).T
+        jacobian = ((behind - ahead) / 2e-4).T  # per prior standard deviation
         if np.isfinite(jacobian).all():
-            found.append(_flat_columns(jacobian, scatter))
+            upper, order = qr(jacobian, mode="r", pivoting=True, check_finite=False)
+            left = np.abs(np.diagonal(upper)) > FLAT_PART * max(scatter, 1e-300)
+            found.append(tuple(int(j) for j in order[np.count_nonzero(left) :]))
     return found
-
-
-def _flat_columns(jacobian: Array, scatter: float) -> tuple[int, ...]:
-    upper, order = qr(jacobian, mode="r", pivoting=True, check_finite=False)
-    left = np.abs(np.diagonal(upper))
-    threshold = _FLAT * max(scatter, 1e-300)
-    n_left = np.count_nonzero(left > threshold)
-    return tuple(int(j) for j in order[n_left:])
 
 
 type Box = Mapping[str, tuple[float, float]]
@@ -334,13 +315,6 @@ def _check_box(box: Box, names: tuple[str, ...]) -> None:
             )
 
 
-def held_note(held: tuple[str, ...]) -> str:
-    """Name the parameters that were held."""
-    if not held:
-        return ""
-    return f"the data do not determine {', '.join(held)}: held at the prior's location"
-
-
 def edge_notes(names: tuple[str, ...], x: Array, lower: Array, upper: Array, what: str) -> str:
     """Name the coordinates that ended on an edge."""
     span = np.where(np.isfinite(upper - lower), upper - lower, 1.0)
@@ -371,7 +345,13 @@ def fit_identified(
         n_evaluations=found.n_evaluations,
         seconds=time.perf_counter() - clock,
         converged=found.converged,
-        notes=(found.note, held_note(held), edges),
+        notes=(
+            found.note,
+            f"the data do not determine {', '.join(held)}: held at the prior's location"
+            if held
+            else "",
+            edges,
+        ),
     )
 
 
@@ -396,10 +376,6 @@ def search_in_box(
     return fit_identified(problem, method, fit)
 
 
-# Instead of `inf`, with which the population's spread, SciPy's stopping rule, is undefined.
-_WORST = 1e100
-
-
 def estimate_differential_evolution(
     problem: Problem, rng: np.random.Generator, *, box: Box | None = None, **settings: Any
 ) -> PointEstimate:
@@ -416,7 +392,8 @@ def estimate_differential_evolution(
             nonlocal evaluated
             values = space.cost(np.atleast_2d(x.T))
             evaluated += values.size
-            return np.minimum(values, _WORST)
+            # With `inf` the population's spread, SciPy's stopping rule, is undefined.
+            return np.minimum(values, 1e100)
 
         # The stubs know the scalar signature only.
         batched: Any = cost
@@ -431,125 +408,3 @@ def estimate_differential_evolution(
         return Found(np.asarray(result.x), evaluated, bool(result.success))
 
     return search_in_box(problem, "differential_evolution", box, minimise)
-
-
-# Relative step of the central differences, in prior standard deviations.
-_DIFFERENCE = 1e-5
-_TOLERANCE = 1e-13
-_PRECISE = 1e-9
-
-
-class _Polished(NamedTuple):
-    z: Array
-    cost: float
-    converged: bool
-
-
-class _Descent:
-    """Residuals and their Jacobian in coordinates of prior location and width."""
-
-    def __init__(self, problem: Problem) -> None:
-        self.problem = problem
-        self.location, self.width = location(problem), prior_widths(problem.priors)
-        self.lower = (np.array([p.lower for p in problem.priors.free]) - self.location) / self.width
-        self.upper = (np.array([p.upper for p in problem.priors.free]) - self.location) / self.width
-        self.n_evaluations = 0
-        # The tolerances suit residuals of the order of one.
-        scatter = float(np.linalg.norm(problem.response - problem.response.mean()))
-        self.scale = scatter if scatter > 0.0 else 1.0
-
-    def natural(self, z: Array) -> Array:
-        self.n_evaluations += z.shape[0]
-        return self.problem.theta(self.location + z * self.width)
-
-    def residuals(self, z: Array) -> Array:
-        return np.asarray(residuals(self.problem, self.natural(z[None]))[0] / self.scale)
-
-    def jacobian(self, z: Array) -> Array:
-        # All differences in one model evaluation; one-sided on a bound.
-        step = _DIFFERENCE * np.eye(z.size)
-        ahead, behind = np.minimum(z + step, self.upper), np.maximum(z - step, self.lower)
-        span = np.diagonal(ahead) - np.diagonal(behind)
-        r = residuals(self.problem, self.natural(np.concatenate([ahead, behind])))
-        slope = (r[: z.size] - r[z.size :]) / (self.scale * span[:, None])
-        # A step beyond where the model has a value says nothing about that direction.
-        return np.asarray(np.nan_to_num(slope, nan=0.0, posinf=0.0, neginf=0.0).T)
-
-    def polish(self, z: Array) -> _Polished:
-        from scipy.optimize import least_squares  # late: a tenth of a second
-
-        result = least_squares(
-            self.residuals,
-            z,
-            jac=self.jacobian,
-            bounds=(self.lower, self.upper),
-            x_scale="jac",
-            ftol=_TOLERANCE,
-            xtol=_TOLERANCE,
-            gtol=_TOLERANCE,
-            max_nfev=400,
-        )
-        return _Polished(np.asarray(result.x), 2.0 * float(result.cost), bool(result.success))
-
-
-def estimate_least_squares(
-    problem: Problem, rng: np.random.Generator, *, n_screen: int = 1024, n_polish: int = 4
-) -> PointEstimate:
-    """Minimise the sum of squares from many starts within the prior's bounds.
-
-    Prior draws are screened in one batched evaluation, and the best of each of `n_polish` groups is
-    polished by SciPy's trust-region reflective method. Of more than a few thousand rows a
-    representative part is used, and the best result is polished on all of them.
-    """
-
-    def fit(reduced: Problem) -> tuple[Array, Found, str]:
-        rough = _Descent(representative_rows(reduced))
-        polished = [rough.polish(start) for start in _starts(rough, rng, n_screen, n_polish)]
-        best = min(polished, key=lambda p: p.cost)
-        n_agree = sum(p.cost <= best.cost * (1.0 + _PRECISE) + _PRECISE**2 for p in polished)
-        evaluations, fine = rough.n_evaluations, rough
-        if rough.problem is not reduced:
-            fine = _Descent(reduced)
-            best = fine.polish(best.z)
-            evaluations += fine.n_evaluations
-        x = fine.location + best.z * fine.width
-        lower, upper = np.array([(p.lower, p.upper) for p in reduced.priors.free]).T
-        valley = "the cost still falls along a valley without end in sight"
-        said = [f"{n_agree} of {len(polished)} starts end at the lowest cost"]
-        said += [] if best.converged else [valley]
-        edges = edge_notes(reduced.names, x, lower, upper, "the prior's bounds")
-        notes = "; ".join(filter(None, (edges, _far_note(reduced, x))))
-        theta = reduced.of_model(reduced.theta(x[None]))[0]
-        return theta, Found(x, evaluations, best.converged, "; ".join(said)), notes
-
-    return fit_identified(problem, "least_squares", fit)
-
-
-def _far_note(problem: Problem, x: Array) -> str:
-    """Name the estimates that the prior deems almost impossible."""
-    low, high = central_interval(problem)
-    far = [n for n, out in zip(problem.names, (x < low) | (x > high), strict=True) if out]
-    return f"{', '.join(far)} outside the prior's central 99.8 %" if far else ""
-
-
-def _starts(descent: _Descent, rng: np.random.Generator, n_screen: int, n_polish: int) -> Array:
-    drawn = descent.problem.priors.sample(rng, max(n_screen, n_polish))
-    z = (drawn - descent.location) / descent.width
-    cost = sum_of_squares(descent.problem, descent.natural(z))
-    groups = np.array_split(np.arange(z.shape[0]), n_polish)
-    # Not the best of all, which may share one basin.
-    best = np.array([group[cost[group].argmin()] for group in groups])
-    best = best[np.isfinite(cost[best])]
-    if best.size == 0:
-        problem = descent.problem
-        theta = problem.of_model(problem.theta(drawn))
-        check_defined(
-            problem.bound, theta, problem.conditions, problem.table.source, problem.table.lines
-        )
-        raise CalibError(
-            f"{problem.bound.model.name} has no value for some rows, wherever in the "
-            "prior its parameters are drawn",
-            where=problem.table.source,
-            hint="look for impossible conditions in the data, or widen the prior",
-        )
-    return np.asarray(z[best])

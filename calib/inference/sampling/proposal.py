@@ -1,4 +1,4 @@
-"""Fit a proposal to the posterior by adaptive importance sampling.
+"""A proposal fitted to a posterior: mixtures of Student-t behind a triangular map, one for a mode.
 
 Curvature at the posterior's modes gives a first proposal; rounds of adaptive importance sampling
 (Cappe et al. 2008, doi:10.1007/s11222-008-9059-x) fit it to the posterior. Draws from the result
@@ -9,44 +9,265 @@ weights estimate the evidence.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp
+from scipy.special import gammaln, logsumexp
 
-from calib.inference.sampling.mixture import (
-    Mixture,
-    Straightener,
-    StudentT,
-    fit_mixture,
-    log_sum,
-    moments,
+from calib.inference.constants import (
+    BROAD_SHARE,
+    FITTED_DRAWS,
+    GOOD_EFFICIENCY,
+    MOST_COMPONENTS,
+    ROUND_SIZES,
+    WIDENING,
 )
 from calib.models.base import Array
 
-_FITTED_DRAWS = 6000
-_BROAD_SCALE, _BROAD_DOF = 1.3, 4.0
-_LEAST_BROAD, _MOST_BROAD = 0.08, 0.4
-# A mode that seems to have no mass is proposed this often all the same.
-_LEAST_SHARE = 0.01
+type LogProb = Callable[[Array], Array]
+
+
+@dataclass(frozen=True)
+class StudentT:
+    """A multivariate Student-t: mean (d,), lower factor of the scale matrix (d, d), and dof."""
+
+    mean: Array
+    cholesky: Array
+    dof: float
+
+    def sample(self, rng: np.random.Generator, size: int) -> Array:
+        """Draw, shape (size, d)."""
+        normal = rng.standard_normal((size, self.mean.size))
+        chi2 = rng.chisquare(self.dof, size) / self.dof
+        return self.mean + (normal / np.sqrt(chi2)[:, None]) @ self.cholesky.T
+
+    def squared_distance(self, t: Array) -> Array:
+        """Squared Mahalanobis distance from the mean, shape (k, d) to (k,)."""
+        z = np.linalg.inv(self.cholesky) @ (t - self.mean).T
+        return np.asarray(np.einsum("dk,dk->k", z, z))
+
+    def log_prob(self, t: Array) -> Array:
+        """Log density, shape (k, d) to (k,)."""
+        d, dof = self.mean.size, self.dof
+        constant = gammaln(0.5 * (dof + d)) - gammaln(0.5 * dof) - 0.5 * d * np.log(dof * np.pi)
+        constant -= np.log(np.diag(self.cholesky)).sum()
+        power = 0.5 * (dof + d)
+        return np.asarray(constant - power * np.log1p(self.squared_distance(t) / dof))
+
+
+def log_sum(parts: Array) -> Array:
+    """Log of the sum of exponentials over the first axis, all finite."""
+    top = parts.max(axis=0)
+    return np.asarray(top + np.log(np.exp(parts - top).sum(axis=0)))
+
+
+def moments(x: Array, weight: Array) -> tuple[Array, Array] | None:
+    """Weighted mean and Cholesky factor of the covariance; None where it is degenerate."""
+    mean = weight @ x
+    centred = x - mean
+    covariance = (centred * weight[:, None]).T @ centred
+    scale = np.sqrt(np.diag(covariance))
+    # Standard deviations that are rounding of the mean are no spread.
+    if not (np.isfinite(scale).all() and (scale > 1e-12 * (1.0 + abs(mean))).all()):
+        return None
+    correlation = covariance / np.outer(scale, scale) + 1e-9 * np.eye(mean.size)
+    try:
+        return mean, scale[:, None] * np.linalg.cholesky(correlation)
+    except np.linalg.LinAlgError:
+        return None
+
+
+@dataclass(frozen=True)
+class TriangularMap:
+    """A one-to-one map of coordinates t to v, in which a bent posterior is nearer to a normal.
+
+    Each standardised coordinate, from the last (the logarithm of the noise scale) to the first, is
+    regressed on those before it, their squares and their products; what is left of it, over a scale
+    that grows with the last coordinate, is its v. It is the Knothe-Rosenblatt rearrangement to
+    second order (Parno & Marzouk 2018, doi:10.1137/17M1134640).
+
+    Parameters
+    ----------
+    mean, sd : ndarray, shape (d,)
+        Of t.
+    coefficients : ndarray, shape (1 + d (d + 3)/2, d)
+        Of the regressions, in the order last to first; zero from a coordinate's own feature on.
+    growth : ndarray, shape (d,)
+        Of the logarithm of each coordinate's scale with the last coordinate, in that order.
+    """
+
+    mean: Array
+    sd: Array
+    coefficients: Array
+    growth: Array
+
+    @classmethod
+    def identity(cls, d: int) -> TriangularMap:
+        """Leave d coordinates as they are."""
+        return cls(np.zeros(d), np.ones(d), np.zeros((1 + d * (d + 3) // 2, d)), np.zeros(d))
+
+    @classmethod
+    def fit(cls, t: Array, weight: Array, effective: float) -> TriangularMap:
+        """Fit to draws (k, d) of weights (k,), sum 1, worth so many independent ones."""
+        mean = weight @ t
+        sd = np.sqrt(weight @ np.square(t - mean))
+        z = ((t - mean) / sd)[:, ::-1]
+        features, last = _features(z), _bounded(z[:, 0])
+        coefficients = _regress(features, z, weight, effective)
+        # With the last coordinate all scales grow alike, and often much.
+        left = np.log(np.abs(z - features @ coefficients) + 1e-300)
+        centred = weight * (last - weight @ last)
+        growth = np.clip(centred @ left / (centred @ last), -1.0, 1.0)
+        growth[0] = 0.0
+        # Where the scale is small a draw says more about the bend.
+        precise = weight * np.exp(-2.0 * growth[1:].mean() * last) if len(growth) > 1 else weight
+        coefficients = _regress(features, z, precise / precise.sum(), effective)
+        return cls(mean, sd, coefficients, growth)
+
+    def straighten(self, t: Array) -> tuple[Array, Array]:
+        """Return v, shape (k, d), and the log of the Jacobian |dv/dt|, shape (k,)."""
+        z = ((t - self.mean) / self.sd)[:, ::-1]
+        log_scale = np.outer(_bounded(z[:, 0]), self.growth)
+        v = (z - _features(z) @ self.coefficients) * np.exp(-log_scale)
+        return v[:, ::-1], -log_scale.sum(axis=1) - np.log(self.sd).sum()
+
+    def bend(self, v: Array) -> Array:
+        """Return t, shape (k, d)."""
+        z = v[:, ::-1].copy()
+        z[:, 0] += self.coefficients[0, 0]
+        z[:, 1:] *= np.exp(np.outer(_bounded(z[:, 0]), self.growth[1:]))
+        features = np.ones((len(v), 1))
+        for i in range(1, z.shape[1]):
+            features = np.concatenate([features, *_own_features(z, i - 1)], axis=1)
+            z[:, i] += features @ self.coefficients[: features.shape[1], i]
+        return np.asarray(z[:, ::-1] * self.sd + self.mean)
+
+
+def _bounded(z: Array) -> Array:
+    """Saturate at four standard deviations: tails beyond the fitted bulk bend no further."""
+    return np.asarray(4.0 * np.tanh(z / 4.0))
+
+
+def _features(z: Array) -> Array:
+    """One, and for each coordinate itself and its products with those up to it, (k, 1 + ...).
+
+    The features of the first i coordinates come first.
+    """
+    own = [part for i in range(z.shape[1]) for part in _own_features(z, i)]
+    return np.concatenate([np.ones((len(z), 1)), *own], axis=1)
+
+
+def _own_features(z: Array, i: int) -> tuple[Array, Array]:
+    bounded = _bounded(z[:, : i + 1])
+    return z[:, [i]], bounded[:, [i]] * bounded
+
+
+def _regress(features: Array, z: Array, weight: Array, effective: float) -> Array:
+    """Regress each coordinate on the features of those before it.
+
+    Squares and products are shrunk by as much as noise alone would have made of them (the
+    positive-part rule of James and Stein): a posterior that is straight stays straight.
+    """
+    weighted = features * weight[:, None]
+    gram, moment = weighted.T @ features, weighted.T @ z
+    # As if three draws had said that coordinates are unrelated.
+    gram[np.diag_indices_from(gram)] += np.where(np.arange(len(gram)) > 0, 3.0 / effective, 0.0)
+    coefficients = np.zeros((len(gram), z.shape[1]))
+    linear = [0]
+    for i in range(z.shape[1]):
+        n = 1 + i * (i + 3) // 2  # features of the coordinates before this one
+        plain = np.zeros(n)
+        plain[linear] = np.linalg.solve(gram[np.ix_(linear, linear)], moment[linear, i])
+        full = np.linalg.solve(gram[:n, :n], moment[:n, i])
+        gain = float((full - plain) @ moment[:n, i])
+        left = float(weight @ np.square(z[:, i]) - full @ moment[:n, i])
+        noise = (n - len(linear)) / effective * left
+        share = max(0.0, 1.0 - noise / gain) if gain > 0.0 else 0.0
+        coefficients[:n, i] = plain + share * (full - plain)
+        linear.append(n)
+    return coefficients
+
+
+def fit_mixture(
+    x: Array, weight: Array, effective: float, rng: np.random.Generator
+) -> tuple[Array, tuple[StudentT, ...]]:
+    """Fit Student-t components to weighted draws (k, d), weights (k,) of sum 1.
+
+    By expectation maximisation (Peel & McLachlan 2000, doi:10.1023/A:1008981510081). What the
+    draws are worth limits the number of components, five for each entry of a covariance; these
+    start at draws picked at random. Covariances are drawn towards a half of the whole by as many
+    draws as there are dimensions.
+    """
+    k, d = x.shape
+    m = int(np.clip(effective / (5.0 * d**2), 1, MOST_COMPONENTS))
+    whole = np.cov(x.T, aweights=weight, ddof=0).reshape(d, d)
+    centres = x[rng.choice(k, size=m, p=weight)] if m > 1 else weight @ x[None]
+    factor = (0.7 if m > 1 else 1.0) * np.linalg.cholesky(whole)
+    shares, parts = np.full(m, 1.0 / m), [StudentT(c, factor, 6.0) for c in centres]
+    for _ in range(20):
+        logs = np.log(shares)[:, None] + np.stack([part.log_prob(x) for part in parts])
+        by_part = np.exp(logs - log_sum(logs)) * weight
+        mass = by_part.sum(axis=1)
+        kept = mass * effective >= d
+        kept[mass.argmax()] = True  # however little the draws are worth
+        updated = []
+        for part, own, total in zip(parts, by_part, mass, strict=True):
+            # Draws far out in a component's tails weigh little.
+            tail = own * (part.dof + d) / (part.dof + part.squared_distance(x))
+            mean = tail @ x / tail.sum()
+            scatter = (tail[:, None] * (x - mean)).T @ (x - mean) + 0.5 * d / effective * whole
+            updated.append((mean, scatter / (total + d / effective)))
+        shares = mass[kept] / mass[kept].sum()
+        parts = [
+            StudentT(mean, np.linalg.cholesky(covariance), 6.0)
+            for (mean, covariance), keep in zip(updated, kept, strict=True)
+            if keep
+        ]
+    return shares, tuple(StudentT(p.mean, WIDENING * p.cholesky, p.dof) for p in parts)
 
 
 @dataclass(frozen=True)
 class Part:
-    """A mixture of Student-t in straightened coordinates: what is proposed about one mode."""
+    """What is proposed about one mode: components of weights (m,), in mapped coordinates."""
 
-    straightener: Straightener
-    mixture: Mixture
+    weights: Array
+    components: tuple[StudentT, ...]
+    map: TriangularMap
 
     def draw(self, rng: np.random.Generator, size: int) -> Array:
         """Draw, shape (size, d)."""
-        return self.straightener.bend(self.mixture.sample(rng, size))[0]
+        counts = rng.multinomial(size, self.weights)
+        drawn = [c.sample(rng, int(n)) for c, n in zip(self.components, counts, strict=True)]
+        return self.map.bend(np.concatenate(drawn))
 
     def log_prob(self, t: Array) -> Array:
         """Log density, shape (k, d) to (k,)."""
-        v, log_jacobian = self.straightener.straighten(t)
-        return self.mixture.log_prob(v) + log_jacobian
+        v, log_jacobian = self.map.straighten(t)
+        logs = np.log(self.weights)[:, None] + np.stack([c.log_prob(v) for c in self.components])
+        return log_sum(logs) + log_jacobian
+
+    def fitted(
+        self, draws: Array, weight: Array, effective: float, trust: float, rng: np.random.Generator
+    ) -> Part:
+        """Return the part fitted to draws (k, d); as it is where they are degenerate or few.
+
+        A broad component covers what the others miss. The less the proposal that the draws came
+        from was to be trusted, the larger is its share.
+        """
+        if effective < 2 * draws.shape[1] or moments(draws, weight) is None:
+            return self
+        found = TriangularMap.fit(draws, weight, effective)
+        v, _ = found.straighten(draws)
+        straight = moments(v, weight)
+        if straight is None:
+            return self
+        least, most = BROAD_SHARE
+        share = least + (most - least) * (1.0 - trust) ** 2
+        shares, components = fit_mixture(v, weight, effective, rng)
+        broad = StudentT(straight[0], 1.3 * straight[1], 4.0)
+        return Part(np.append((1.0 - share) * shares, share), (*components, broad), found)
 
 
 @dataclass(frozen=True)
@@ -59,7 +280,7 @@ class Proposal:
     @property
     def n_dim(self) -> int:
         """Dimension."""
-        return self.parts[0].mixture.n_dim
+        return int(self.parts[0].map.mean.size)
 
     def draw(self, rng: np.random.Generator, size: int) -> tuple[Array, Array]:
         """Draw, and return the log density there, shapes (size, d) and (size,)."""
@@ -70,90 +291,41 @@ class Proposal:
 
     def log_prob(self, t: Array) -> Array:
         """Log density, shape (k, d) to (k,)."""
-        return np.asarray(log_sum(self._log_parts(t)))
+        return log_sum(self._log_parts(t))
 
-    def shares(self, t: Array) -> Array:
-        """Return how probable it is that each part proposed a point, shape (k, d) to (m, k)."""
-        log_parts = self._log_parts(t)
-        return np.asarray(np.exp(log_parts - log_sum(log_parts)))
+    def _log_parts(self, t: Array) -> Array:
+        return np.log(self.weights)[:, None] + np.stack([part.log_prob(t) for part in self.parts])
 
     def extended(self, t: Array) -> Proposal:
         """Return the proposal with one more part, about draws (k, d) that lie beside the others."""
         found = moments(t, np.full(len(t), 1.0 / len(t)))
         if found is None:
             return self
-        straight, one = Straightener.identity(self.n_dim), np.ones(1)
-        part = Part(straight, Mixture(one, (StudentT(*found, _BROAD_DOF),)))
+        part = Part(np.ones(1), (StudentT(*found, 4.0),), TriangularMap.identity(self.n_dim))
         share = 1.0 / (len(self.parts) + 1)
         return Proposal(np.append((1.0 - share) * self.weights, share), (*self.parts, part))
 
-    def _log_parts(self, t: Array) -> Array:
-        logs = [part.log_prob(t) for part in self.parts]
-        return np.log(self.weights)[:, None] + np.stack(logs)
+    def fitted(
+        self, draws: Array, weight: Array, effective: float, trust: float, rng: np.random.Generator
+    ) -> Proposal:
+        """Return the proposal fitted to weighted draws (k, d), worth so many independent ones.
 
-
-def fit_proposal(
-    old: Proposal, draws: Array, weight: Array, worth: float, trust: float, rng: np.random.Generator
-) -> Proposal:
-    """Fit a proposal to weighted draws (k, d), worth so many independent ones.
-
-    One step of expectation maximisation over the parts: each is fitted to the draws in proportion
-    to the probability that it proposed them, and stays as it is where they are degenerate.
-    """
-    if weight.size > _FITTED_DRAWS:
-        draws = draws[systematic(weight, _FITTED_DRAWS, rng)]
-        weight = np.full(_FITTED_DRAWS, 1.0 / _FITTED_DRAWS)
-    by_part = old.shares(draws) * weight
-    mass = by_part.sum(axis=1)
-    parts = [
-        _fit_part(part, draws, own, total, worth, trust, rng)
-        for part, own, total in zip(old.parts, by_part, mass, strict=True)
-    ]
-    weights = np.maximum(mass, _LEAST_SHARE)
-    return Proposal(weights / weights.sum(), tuple(parts))
-
-
-def first_proposal(parts: Sequence[Mixture]) -> Proposal:
-    """Propose each of some mixtures as often, in coordinates that are not straightened."""
-    straight = Straightener.identity(parts[0].n_dim)
-    equal = np.full(len(parts), 1.0 / len(parts))
-    return Proposal(equal, tuple(Part(straight, mixture) for mixture in parts))
-
-
-def _fit_part(
-    old: Part,
-    draws: Array,
-    weight: Array,
-    mass: float,
-    worth: float,
-    trust: float,
-    rng: np.random.Generator,
-) -> Part:
-    """Fit a part to draws whose weights sum to `mass`.
-
-    A broad component covers what the others miss. The less the proposal that the draws came from
-    was to be trusted, the larger is its share.
-    """
-    effective = worth * mass
-    if effective < 2 * draws.shape[1]:
-        return old
-    weight = weight / mass
-    try:
-        straightener = Straightener.fit(draws, weight)
-    except np.linalg.LinAlgError:
-        return old
-    v, _ = straightener.straighten(draws)
-    straight = moments(v, weight)
-    if straight is None:
-        return old
-    mean, cholesky = straight
-    share = _LEAST_BROAD + (_MOST_BROAD - _LEAST_BROAD) * (1.0 - trust) ** 2
-    fitted = fit_mixture(v, weight, mean, cholesky, effective, rng)
-    broad = StudentT(mean, _BROAD_SCALE * cholesky, _BROAD_DOF)
-    return Part(
-        straightener,
-        Mixture(np.append((1.0 - share) * fitted.weights, share), (*fitted.components, broad)),
-    )
+        One step of expectation maximisation over the parts: each is fitted to the draws in
+        proportion to the probability that it proposed them. A mode that seems to have no mass is
+        proposed once in a hundred all the same.
+        """
+        if weight.size > FITTED_DRAWS:
+            draws = draws[systematic(weight, FITTED_DRAWS, rng)]
+            weight = np.full(FITTED_DRAWS, 1.0 / FITTED_DRAWS)
+        logs = self._log_parts(draws)
+        by_part = np.exp(logs - log_sum(logs)) * weight
+        mass = np.maximum(by_part.sum(axis=1), 1e-300)
+        parts = [
+            part.fitted(draws, own / total, effective * total, trust, rng)
+            for part, own, total in zip(self.parts, by_part, mass, strict=True)
+        ]
+        weights = np.maximum(mass, 0.01)
+        return Proposal(weights / weights.sum(), tuple(parts))
 
 
 def systematic(weight: Array, size: int, rng: np.random.Generator) -> NDArray[np.intp]:
@@ -162,25 +334,14 @@ def systematic(weight: Array, size: int, rng: np.random.Generator) -> NDArray[np
     return np.minimum(np.searchsorted(np.cumsum(weight), levels), weight.size - 1)
 
 
-type LogProb = Callable[[Array], Array]
-
-# Shares, scales and degrees of freedom of the first proposal, about the first guess: the curvature
-# at a mode often promises too narrow a posterior.
-_FIRST = ((0.6, 1.2, 6.0), (0.25, 2.0, 4.0), (0.15, 4.0, 3.0))
-# Draws of each round per dimension plus five, and the efficiency beyond which more are no use.
-_ROUNDS, _GOOD = (60, 120, 250, 400), 0.9
-
-
-@dataclass(frozen=True)
-class Guess:
+class Guess(NamedTuple):
     """A first guess of where a density lies: mean (d,) and Cholesky factor (d, d)."""
 
     mean: Array
     cholesky: Array
 
 
-@dataclass(frozen=True)
-class Assessment:
+class Assessment(NamedTuple):
     """What importance sampling from a proposal says of it and of the density.
 
     The log of the density's integral, and the effective fraction of the draws, in (0, 1]; zero if
@@ -197,46 +358,50 @@ def adapt(
     """Fit a proposal to an unnormalised density ``(k, d) -> (k,)`` by adaptive importance sampling.
 
     Every round draws from the proposal that all rounds before it made, and ends the work if it
-    resembles the density well enough; the assessment is by the last round's draws. There is a guess
-    for each mode that is known.
+    resembles the density well enough; the assessment is by the last round's draws. Draws of all
+    rounds are weighted as from the mixture of their proposals, so that early, poor proposals do no
+    harm (Cornuet et al. 2012, doi:10.1111/j.1467-9469.2011.00756.x). There is a guess for each
+    known mode, which often promises too narrow a posterior: the first proposal is wider.
     """
     d = guesses[0].mean.size
-    proposal = first_proposal(
-        [
-            Mixture(
-                np.array([share for share, _, _ in _FIRST]),
-                tuple(
-                    StudentT(guess.mean, scale * guess.cholesky, dof) for _, scale, dof in _FIRST
-                ),
+    wider = ((0.6, 1.2, 6.0), (0.25, 2.0, 4.0), (0.15, 4.0, 3.0))
+    proposal = Proposal(
+        np.full(len(guesses), 1.0 / len(guesses)),
+        tuple(
+            Part(
+                np.array([share for share, _, _ in wider]),
+                tuple(StudentT(g.mean, scale * g.cholesky, dof) for _, scale, dof in wider),
+                TriangularMap.identity(d),
             )
-            for guess in guesses
-        ]
+            for g in guesses
+        ),
     )
-    memory = _Memory()
-    for size in _ROUNDS:
+    rounds: list[tuple[Proposal, int]] = []
+    all_draws, all_values = np.empty((0, d)), np.empty(0)
+    for size in ROUND_SIZES:
         draws, log_q = proposal.draw(rng, size * (d + 5) * len(guesses))
         value = log_prob(draws)
         found = _assess(value - log_q)
-        if found.efficiency > _GOOD or found.efficiency == 0.0:
+        if found.efficiency > GOOD_EFFICIENCY or found.efficiency == 0.0:
             break
-        memory.add(proposal, draws, value)
-        draws, weight = memory.weighted()
-        weight = _tempered(weight)
-        proposal = fit_proposal(proposal, draws, weight, _effective(weight), found.efficiency, rng)
+        rounds.append((proposal, len(draws)))
+        possible = np.isfinite(value)
+        all_draws = np.concatenate([all_draws, draws[possible]])
+        all_values = np.concatenate([all_values, value[possible]])
+        log_mixed = log_sum(np.stack([np.log(n) + q.log_prob(all_draws) for q, n in rounds]))
+        weight = _tempered(all_values - log_mixed)
+        effective = float(1.0 / np.square(weight).sum())
+        proposal = proposal.fitted(all_draws, weight, effective, found.efficiency, rng)
     return proposal, found
 
 
 def refit(
-    log_prob: LogProb,
-    old: Proposal,
-    draws: Array,
-    effective: float,
-    rng: np.random.Generator,
+    log_prob: LogProb, old: Proposal, draws: Array, effective: float, rng: np.random.Generator
 ) -> tuple[Proposal, Assessment]:
     """Fit a proposal to draws (k, d), worth so many, of a chain that the old one left short."""
-    weight = np.full(draws.shape[0], 1.0 / draws.shape[0])
-    proposal = fit_proposal(old, draws, weight, effective, 1.0, rng)
-    drawn, log_q = proposal.draw(rng, _ROUNDS[-2] * (draws.shape[1] + 5))
+    weight = np.full(len(draws), 1.0 / len(draws))
+    proposal = old.fitted(draws, weight, effective, 1.0, rng)
+    drawn, log_q = proposal.draw(rng, ROUND_SIZES[-2] * (draws.shape[1] + 5))
     return proposal, _assess(log_prob(drawn) - log_q)
 
 
@@ -245,63 +410,23 @@ def tempered_moments(draws: Array, log_weight: Array) -> tuple[Array, Array] | N
 
     Log weights (k,) are flattened where few draws carry them.
     """
-    total = logsumexp(log_weight)
-    if not np.isfinite(total):
-        return None
-    return moments(draws, _tempered(np.exp(log_weight - total)))
-
-
-@dataclass
-class _Memory:
-    """Draws of all rounds, weighted as from the mixture of all their proposals.
-
-    So weighted, draws of early, poor proposals help where they happen to lie well and do no harm
-    elsewhere (Cornuet et al. 2012, doi:10.1111/j.1467-9469.2011.00756.x).
-    """
-
-    proposals: list[Proposal] = field(default_factory=list)
-    sizes: list[int] = field(default_factory=list)
-    draws: list[Array] = field(default_factory=list)
-    log_probs: list[Array] = field(default_factory=list)
-
-    def add(self, proposal: Proposal, draws: Array, log_prob: Array) -> None:
-        """Remember a round."""
-        possible = np.isfinite(log_prob)
-        self.proposals.append(proposal)
-        self.sizes.append(draws.shape[0])
-        self.draws.append(draws[possible])
-        self.log_probs.append(log_prob[possible])
-
-    def weighted(self) -> tuple[Array, Array]:
-        """Return all draws (k, d), and their normalised weights (k,)."""
-        draws = np.concatenate(self.draws)
-        log_q = np.stack(
-            [np.log(n) + q.log_prob(draws) for n, q in zip(self.sizes, self.proposals, strict=True)]
-        )
-        log_weight = np.concatenate(self.log_probs) - log_sum(log_q)
-        weight = np.exp(log_weight - log_weight.max())
-        return draws, weight / weight.sum()
+    return moments(draws, _tempered(log_weight)) if np.isfinite(log_weight.max()) else None
 
 
 def _assess(log_weight: Array) -> Assessment:
     if not np.isfinite(log_weight).any():
         return Assessment(-np.inf, 0.0)
-    total = float(logsumexp(log_weight))
-    weight = np.exp(log_weight - total)
+    total, n = float(logsumexp(log_weight)), log_weight.size
+    squares = float(np.square(np.exp(log_weight - total)).sum())
+    return Assessment(total - float(np.log(n)), 1.0 / (n * squares))
+
+
+def _tempered(log_weight: Array) -> Array:
+    """Return weights of sum 1, flattened until enough draws carry them to estimate a covariance."""
     n = log_weight.size
-    return Assessment(total - float(np.log(n)), float(1.0 / (n * np.square(weight).sum())))
-
-
-def _tempered(weight: Array) -> Array:
-    """Flatten weights until enough draws carry them to estimate a covariance."""
-    n = weight.size
     for power in (1.0, 0.7, 0.5, 0.35, 0.25, 0.15):
-        w = weight**power
-        w /= w.sum()
-        if 1.0 / np.square(w).sum() >= min(0.1 * n, 300.0):
-            return np.asarray(w)
-    return np.asarray(w)
-
-
-def _effective(weight: Array) -> float:
-    return float(1.0 / np.square(weight).sum())
+        weight = np.exp(power * (log_weight - log_weight.max()))
+        weight /= weight.sum()
+        if 1.0 / np.square(weight).sum() >= min(0.1 * n, 300.0):
+            break
+    return np.asarray(weight)

@@ -1,24 +1,38 @@
-"""Sample a posterior with emcee: seeded by point estimates, extended until the gate passes."""
+"""Sample a posterior with emcee: seeded by point estimates, extended until the gate passes.
+
+Walkers mix independent draws from a proposal fitted to the posterior with differential evolution
+(ter Braak 2006, doi:10.1007/s11222-006-8769-1); the proposal is fitted again between attempts. The
+last ensemble starts from draws that sequential Monte Carlo carried from the prior to the posterior
+and that know of no optimum, so that what it ends in checks the search for modes.
+"""
 
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from calib.batch.threads import one_thread
 from calib.errors import CalibError
-from calib.inference.diagnostics import LEAST_ENSEMBLES, Gate, GateReport, judge
+from calib.inference.constants import ANNEALED, JUDGED, LEAST_STEPS, LONG_DATA
+from calib.inference.diagnostics import (
+    LEAST_ENSEMBLES,
+    Gate,
+    GateReport,
+    judge,
+    longest_autocorrelation_time,
+)
 from calib.inference.estimators.search import representative_rows
-from calib.inference.joined import Joined, joined
+from calib.inference.priors import SumAndRatio, sum_and_ratio
 from calib.inference.problem import Problem
-from calib.inference.sampling.mixture import moments
-from calib.inference.sampling.mode import Mode, find_modes
-from calib.inference.sampling.proposal import Guess, Proposal, adapt, refit
-from calib.inference.sampling.walkers import anneal, fitted_moves, longest_tau, run_walkers
+from calib.inference.sampling.mode import LogProb, Mode, find_modes
+from calib.inference.sampling.proposal import Guess, Proposal, adapt, moments, refit, systematic
 from calib.inference.trial import try_simulator
 from calib.models.base import Array
 
@@ -49,7 +63,7 @@ class SamplerSettings:
     walkers: int | None = None
     steps: int = 192
     max_steps: int = 25_600
-    keep: int = 4096
+    keep: int = JUDGED
     gate: Gate = field(default_factory=Gate)
 
     def n_walkers(self, n_dim: int) -> int:
@@ -92,6 +106,18 @@ class Draws:
         return self.t.reshape(-1, self.t.shape[-1])
 
 
+class _Counter:
+    """Count the vectors a density is evaluated at."""
+
+    def __init__(self, log_prob: LogProb) -> None:
+        self.log_prob = log_prob
+        self.evaluations = 0
+
+    def __call__(self, t: Array) -> Array:
+        self.evaluations += t.shape[0]
+        return self.log_prob(t)
+
+
 @one_thread()
 def sample_posterior(
     problem: Problem,
@@ -111,58 +137,63 @@ def sample_posterior(
     CalibError
         If no parameters of positive probability can be found.
     """
+    began = time.perf_counter()
     try_simulator(problem)
-    problem = joined(problem)
-    priors = problem.priors
-    if isinstance(priors, Joined) and starts is not None:
+    problem = replace(
+        problem,
+        priors=sum_and_ratio(problem.priors, problem.bound.model.joined, problem.conditions),
+    )
+    priors, model, d = problem.priors, problem.bound.model, problem.n_dim
+    if isinstance(priors, SumAndRatio) and starts is not None:
         starts = priors.joined(np.atleast_2d(starts))
-    chosen = _fitting(settings or SamplerSettings(), problem)
+    chosen = settings or SamplerSettings()
+    if chosen.walkers is None:
+        # Where an evaluation is dear, fewer walkers are run.
+        long, dear = problem.squares.n_distinct > LONG_DATA, model.slow or model.uncertain
+        few = 20 if long else 64 if dear else 320
+        chosen = replace(chosen, walkers=max(few, 2 * (d + 1)))
+    walkers = chosen.n_walkers(d)
     root = np.random.SeedSequence(seed) if isinstance(seed, int) else seed
     seeds = root.spawn(1 + chosen.ensembles)
     rng = np.random.default_rng(seeds[0])
-    began = time.perf_counter()
-    count = _Counter(problem.log_prob)
-    walkers = chosen.n_walkers(problem.n_dim)
-    born = None
+
+    count, rough = _Counter(problem.log_prob), representative_rows(problem)
+    # Of long data a part shows where the modes are; from there it is not far.
+    count_rough = count if rough is problem else _Counter(rough.log_prob)
+    annealed = None
     if chosen.ensembles >= LEAST_ENSEMBLES:
-        born = _born(count, problem, walkers, rng)
-        few = born[:_CLIMBED]
-        starts = few if starts is None else np.concatenate([np.atleast_2d(starts), few])
-    modes = _modes(count, problem, rng, starts)
+        drawn = priors.sample(rng, max(ANNEALED, walkers))
+        annealed = anneal(priors.log_prob, count_rough, drawn, rng)
+        if annealed is not None and rough is not problem:
+            annealed = anneal(count_rough, count, annealed[:walkers], rng)
+        if annealed is None:
+            raise _nowhere(problem)
+        annealed = annealed[rng.permutation(len(annealed))]  # copies stand side by side
+        some = annealed[:24]
+        starts = some if starts is None else np.concatenate([np.atleast_2d(starts), some])
+    modes = find_modes(count_rough, priors, rng, starts=starts)
+    if rough is not problem:
+        near = np.array([m.t for m in modes])
+        modes = find_modes(count, priors, rng, starts=near, spread=0)
+        count.evaluations += count_rough.evaluations
     if not np.isfinite(modes[0].log_prob):
         raise _nowhere(problem)
     _refuse_exact(problem, modes[0])
     draws = sample_density(
-        count, _guesses(modes, born), seeds, problem.names, chosen, rng=rng,
-        born=None if born is None else born[:walkers], progress=progress, began=began,
+        count, _guesses(modes, annealed), seeds, problem.names, chosen, rng=rng,
+        last_starts=None if annealed is None else annealed[:walkers], progress=progress,
+        began=began,
     )  # fmt: skip
     draws = replace(draws, mode=modes[0].t)
-    return _by_parameter(draws, priors, chosen.gate) if isinstance(priors, Joined) else draws
-
-
-def _by_parameter(draws: Draws, priors: Joined, gate: Gate) -> Draws:
-    """Return draws in internal coordinates, and judge them there as well."""
+    if not isinstance(priors, SumAndRatio):
+        return draws
+    # Back in the coordinates of the parameters, draws are judged as well.
     t, joint = priors.by_parameter(draws.t), draws.report
-    report = judge(t, priors.names, gate, tau=joint.tau, steps=joint.steps)
+    report = judge(t, priors.names, chosen.gate, tau=joint.tau, steps=joint.steps)
     if not joint.passed:
         reasons = dict.fromkeys((*joint.reasons, *report.reasons))
         report = replace(report, passed=False, reasons=tuple(reasons))
     return replace(draws, t=t, report=report, mode=priors.by_parameter(draws.mode))
-
-
-def _born(log_prob: _Counter, problem: Problem, walkers: int, rng: np.random.Generator) -> Array:
-    """Draws that come from the prior and have not heard of any optimum, (walkers or more, d)."""
-    rough, prior = representative_rows(problem), problem.priors.log_prob
-    count = _Counter(rough.log_prob)
-    drawn = problem.priors.sample(rng, max(_DRAWN, walkers))
-    found = anneal(prior, count, drawn, rng)
-    log_prob.evaluations += count.evaluations
-    if found is not None and rough is not problem:
-        found = anneal(rough.log_prob, log_prob, found[:walkers], rng)
-    if found is None:
-        raise _nowhere(problem)
-    # Resampled draws stand beside their copies.
-    return found[rng.permutation(len(found))]
 
 
 def _nowhere(problem: Problem) -> CalibError:
@@ -173,37 +204,26 @@ def _nowhere(problem: Problem) -> CalibError:
     )
 
 
-def _modes(
-    count: _Counter, problem: Problem, rng: np.random.Generator, starts: Array | None
-) -> list[Mode]:
-    rough = representative_rows(problem)
-    if rough is problem:
-        return find_modes(count, problem.priors, rng, starts=starts)
-    # Of long data a part shows where the modes are; from there it is not far.
-    count_rough = _Counter(rough.log_prob)
-    near = [m.t for m in find_modes(count_rough, problem.priors, rng, starts=starts)]
-    count.evaluations += count_rough.evaluations
-    return find_modes(count, problem.priors, rng, starts=np.array(near), spread=0)
-
-
-def _guesses(modes: Sequence[Mode], born: Array | None) -> list[Guess]:
+def _guesses(modes: Sequence[Mode], annealed: Array | None) -> list[Guess]:
     """Guess what lies about each mode: from the draws (k, d) nearest to it, or its curvature."""
-    choleskys = [np.linalg.cholesky(m.covariance) for m in modes]
-    if born is None:
-        return [Guess(m.t, c) for m, c in zip(modes, choleskys, strict=True)]
+    guesses = [Guess(m.t, np.linalg.cholesky(m.covariance)) for m in modes]
+    if annealed is None:
+        return guesses
     # Log densities by the curvature at each mode.
     by_mode = [
-        m.log_prob - 0.5 * np.square(np.linalg.solve(c, (born - m.t).T)).sum(axis=0)
-        for m, c in zip(modes, choleskys, strict=True)
+        m.log_prob - 0.5 * np.square(np.linalg.solve(g.cholesky, (annealed - m.t).T)).sum(axis=0)
+        for m, g in zip(modes, guesses, strict=True)
     ]
     nearest = np.argmax(by_mode, axis=0)
-    guesses = []
-    for j, (mode, cholesky) in enumerate(zip(modes, choleskys, strict=True)):
-        own = born[nearest == j]
-        found = None
-        if len(own) >= _DRAWS_PER_DIMENSION * born.shape[1]:
-            found = moments(own, np.full(len(own), 1.0 / len(own)))
-        guesses.append(Guess(*found) if found else Guess(mode.t, cholesky))
+    for j in range(len(modes)):
+        own = annealed[nearest == j]
+        # Ten draws for each dimension tell a covariance.
+        found = (
+            moments(own, np.full(len(own), 1.0 / len(own)))
+            if len(own) >= 10 * own.shape[1]
+            else None
+        )
+        guesses[j] = Guess(*found) if found else guesses[j]
     return guesses
 
 
@@ -211,12 +231,12 @@ def _refuse_exact(problem: Problem, mode: Mode) -> None:
     """Refuse data that the model meets but for rounding: the noise has no scale to be found."""
     if "sigma" not in problem.names:
         return
-    left = problem.residuals(problem.theta(mode.t[None]))[0]
+    left = float(np.sqrt(np.mean(problem.residuals(problem.theta(mode.t[None]))[0] ** 2)))
     spread = float(np.std(problem.response))
-    if float(np.sqrt(np.mean(left**2))) < _EXACT * spread:
+    if left < 1e-6 * spread:
         raise CalibError(
-            f"the model meets the data exactly: residuals are {np.sqrt(np.mean(left**2)):.1g} rms, "
-            f"the data spread by {spread:.3g}, so the noise sigma cannot be estimated",
+            f"the model meets the data exactly: residuals are {left:.1g} rms, the data spread by "
+            f"{spread:.3g}, so the noise sigma cannot be estimated",
             where=problem.table.source,
             expected="measurements with scatter, and more rows than parameters",
             hint='fix sigma at the accuracy of the instrument (dist = "fixed" in the prior file), '
@@ -224,49 +244,15 @@ def _refuse_exact(problem: Problem, mode: Mode) -> None:
         )
 
 
-def _fitting(settings: SamplerSettings, problem: Problem) -> SamplerSettings:
-    """Where an evaluation is dear, fewer walkers are run."""
-    if settings.walkers is not None:
-        return settings
-    d, model = problem.n_dim, problem.bound.model
-    if problem.squares.n_distinct > _LONG:
-        return replace(settings, walkers=max(20, 2 * (d + 1)))
-    if model.slow or model.uncertain is not None:
-        return replace(settings, walkers=max(64, 2 * (d + 1)))
-    return settings
-
-
-# Distinct rows from which data are long.
-_LONG = 5000
-# Draws from the prior that are carried to the posterior; of them, starts of the search for modes.
-_DRAWN, _CLIMBED = 512, 24
-# Draws from which a covariance is taken, for each dimension.
-_DRAWS_PER_DIMENSION = 10
-# Residuals of this part of the data's spread are rounding.
-_EXACT = 1e-6
-
-
-class _Counter:
-    """Count the vectors a density is evaluated at."""
-
-    def __init__(self, log_prob: Callable[[Array], Array]) -> None:
-        self.log_prob = log_prob
-        self.evaluations = 0
-
-    def __call__(self, t: Array) -> Array:
-        self.evaluations += t.shape[0]
-        return self.log_prob(t)
-
-
 def sample_density(
-    log_prob: Callable[[Array], Array],
+    log_prob: LogProb,
     first: Sequence[Guess],
     seeds: list[np.random.SeedSequence],
     names: tuple[str, ...],
     settings: SamplerSettings,
     *,
     rng: np.random.Generator,
-    born: Array | None = None,
+    last_starts: Array | None = None,
     progress: Progress | None = None,
     began: float | None = None,
 ) -> Draws:
@@ -276,7 +262,7 @@ def sample_density(
     ----------
     seeds : list of SeedSequence
         One for the adaptation (already used by `rng`) and one for each ensemble.
-    born : ndarray, shape (walkers, d), optional
+    last_starts : ndarray, shape (walkers, d), optional
         Where the last ensemble starts; like the others, at draws from the proposal by default.
     began : float, optional
         ``time.perf_counter()`` at which the work began.
@@ -287,12 +273,12 @@ def sample_density(
     proposal, found = adapt(count, first, rng)
     streams = [np.random.default_rng(seed) for seed in seeds[1:]]
     starts = [_start(count, proposal, walkers, stream) for stream in streams]
-    if born is not None:
-        starts[-1] = born
+    if last_starts is not None:
+        starts[-1] = last_starts
     target = min(settings.steps, settings.max_steps)
     done = 0
     while True:
-        length = target + max(_LEAST_DISCARDED, target // _DISCARDED)
+        length = target + max(16, target // 12)  # the first are not kept
         chains, values, accepted = [], [], []
         for i, stream in enumerate(streams):
             moves = fitted_moves(proposal, stream)
@@ -304,10 +290,10 @@ def sample_density(
             if progress is not None:
                 progress(done + (i + 1) * length, done + len(streams) * length)
         done += len(streams) * length
-        tau = np.stack([longest_tau(chain) for chain in chains]).max(axis=0)
+        tau = np.stack([longest_autocorrelation_time(chain) for chain in chains]).max(axis=0)
         # Fewer draws, evenly thinned, are worth less: what passes is not in doubt.
         last = np.stack(chains), np.stack(values)
-        t, log_probs = _drawn(*last, _JUDGED)
+        t, log_probs = _thinned(*last, JUDGED)
         report = judge(t, names, settings.gate, tau=tau, steps=target)
         neglected = _neglected(proposal, t, log_probs, target, settings.gate.ess_min)
         if neglected.any():
@@ -318,9 +304,11 @@ def sample_density(
         target = min(_longer(target, tau, report, settings.gate), settings.max_steps)
         if neglected.any():
             proposal = proposal.extended(t[neglected])
-        proposal, found = refit(count, proposal, *_pooled(t, report), rng)
-    if settings.keep != _JUDGED:
-        t, log_probs = _drawn(*last, settings.keep)
+        flat = t.reshape(-1, t.shape[-1])
+        worth = report.ess_bulk[np.isfinite(report.ess_bulk)].min(initial=len(flat))
+        proposal, found = refit(count, proposal, flat, float(worth), rng)
+    if settings.keep != JUDGED:
+        t, log_probs = _thinned(*last, settings.keep)
     return Draws(
         t=t,
         log_prob=log_probs,
@@ -348,9 +336,7 @@ def _longer(steps: int, tau: Array, report: GateReport, gate: Gate) -> int:
     return int(steps * (np.clip(needed, _LEAST_LONGER, 4.0) if needed > 1.2 else 2.0))
 
 
-def _start(
-    log_prob: Callable[[Array], Array], proposal: Proposal, walkers: int, rng: np.random.Generator
-) -> Array:
+def _start(log_prob: LogProb, proposal: Proposal, walkers: int, rng: np.random.Generator) -> Array:
     """Overdispersed starting points, every one of positive probability.
 
     emcee accepts walkers that start where the density is zero without a word.
@@ -367,28 +353,17 @@ def _start(
     )
 
 
-def _drawn(t: Array, log_prob: Array, draws: int) -> tuple[Array, Array]:
+def _thinned(t: Array, log_prob: Array, draws: int) -> tuple[Array, Array]:
     """About so many draws of each ensemble, of evenly picked walkers and among its steps.
 
     Shape (ensembles, steps, walkers, d) to (ensembles, walkers, kept, d), and their log densities.
     """
     _, steps, walkers, _ = t.shape
-    kept = min(steps, max(_LEAST_STEPS, draws // walkers))
+    kept = min(steps, max(LEAST_STEPS, draws // walkers))
     few = min(walkers, max(1, draws // kept))
-    if (kept, few) != (steps, walkers):
-        picked = np.linspace(0, steps - 1, kept).round().astype(np.intp)[:, None]
-        who = np.linspace(0, walkers - 1, few).round().astype(np.intp)
-        t, log_prob = t[:, picked, who], log_prob[:, picked, who]
-    return t.swapaxes(1, 2), log_prob.swapaxes(1, 2)
-
-
-# Draws of each ensemble that the gate looks at, and of how many steps at least: of few, effective
-# sizes come out too large (by a tenth of 32).
-_JUDGED, _LEAST_STEPS = 4096, 32
-# One step in so many is run before those that are kept, and so many at least.
-_DISCARDED, _LEAST_DISCARDED = 12, 16
-# A region of at least this part of the draws must have been proposed so often, or entered.
-_LEAST_REGION, _LEAST_PROPOSED = 0.003, 5.0
+    at = np.linspace(0, steps - 1, kept).round().astype(np.intp)
+    who = np.linspace(0, walkers - 1, few).round().astype(np.intp)[:, None]
+    return t[:, at, who], log_prob[:, at, who]
 
 
 def _neglected(
@@ -407,17 +382,107 @@ def _neglected(
     ordered = np.sort(ratio, axis=None)
     n_proposed = log_prob.shape[0] * log_prob.shape[1] * steps
     proposed = n_proposed * np.cumsum(ordered) / ordered.sum()
-    size = int(np.searchsorted(proposed, _LEAST_PROPOSED))
+    size = int(np.searchsorted(proposed, 5.0))  # draws that stand for five proposals at most
     inside = ratio < ordered[size]
     entered = (inside[:, :, 1:] & ~inside[:, :, :-1]).sum()
     share = size / ratio.size
-    if share < _LEAST_REGION or entered >= max(1.0, least_ess * share / (1.0 - share)):
+    if share < 0.003 or entered >= max(1.0, least_ess * share / (1.0 - share)):
         return np.zeros_like(inside)
     return np.asarray(inside)
 
 
-def _pooled(t: Array, report: GateReport) -> tuple[Array, float]:
-    """Draws of all ensembles, and what they are worth."""
-    flat = t.reshape(-1, t.shape[-1])
-    worth = report.ess_bulk[np.isfinite(report.ess_bulk)].min(initial=np.inf)
-    return flat, float(min(worth, flat.shape[0]))
+type Moves = Sequence[tuple[Any, float]]
+
+
+def local_moves() -> Moves:
+    """Differential evolution; a tenth are jumps by whole differences, from mode to mode.
+
+    Steps of many lengths: short ones are accepted in corners.
+    """
+    import emcee  # late: half a second, which predicting from a posterior does without
+
+    return [(emcee.moves.DEMove(sigma=1.0), 0.9), (emcee.moves.DEMove(gamma0=1.0), 0.1)]
+
+
+def fitted_moves(proposal: Proposal, rng: np.random.Generator) -> Moves:
+    """Independent draws from a proposal in six of seven steps, local moves in the others."""
+    import emcee
+
+    def draw(coords: Array, _: Any) -> tuple[Array, Array]:
+        new, log_q = proposal.draw(rng, len(coords))
+        return new, proposal.log_prob(coords) - log_q
+
+    local = [(move, 0.15 * share) for move, share in local_moves()]
+    return [(emcee.moves.MHMove(draw), 0.85), *local]
+
+
+def run_walkers(
+    log_prob: LogProb, start: Array, moves: Moves, steps: int, rng: np.random.Generator
+) -> tuple[Array, Array, float]:
+    """Run walkers from where they start, shape (walkers, d), every one of positive density.
+
+    Returns
+    -------
+    chain : ndarray, shape (steps, walkers, d)
+    log_prob : ndarray, shape (steps, walkers)
+    accepted : float
+        Fraction of the moves.
+
+    Raises
+    ------
+    ValueError
+        If the density is not a number somewhere.
+    """
+    import emcee
+
+    sampler = emcee.EnsembleSampler(*start.shape, log_prob, vectorize=True, moves=moves)
+    # emcee's wrapper prints the arguments of whatever ends a call, an interruption as well.
+    sampler.log_prob_fn = log_prob
+    sampler.random_state = np.random.RandomState(rng.integers(2**32)).get_state()
+    with warnings.catch_warnings():
+        # numpy 2 deprecates what emcee does inside its moves.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        sampler.run_mcmc(start, steps, skip_initial_state_check=True)
+    accepted = float(np.mean(sampler.acceptance_fraction))
+    return sampler.get_chain(), sampler.get_log_prob(), accepted
+
+
+def anneal(first: LogProb, second: LogProb, draws: Array, rng: np.random.Generator) -> Array | None:
+    """Move draws (k, d) of one unnormalised density to another by sequential Monte Carlo.
+
+    The target moves in steps that leave half of the draws effective; after each, draws are
+    resampled and moved by differential evolution (Del Moral, Doucet & Jasra 2006,
+    doi:10.1111/j.1467-9868.2006.00553.x). The second density must be zero wherever the first is;
+    None if it is zero at all draws.
+    """
+    from scipy.optimize import brentq  # late: a tenth of a second
+
+    done = 0.0
+    while True:
+        gain = second(draws) - first(draws)
+        possible = gain[np.isfinite(gain)]
+        if not possible.size:
+            return None
+
+        def excess(step: float, gain: Array = possible) -> float:
+            """Effective draws of a step, beyond half of the possible ones."""
+            log_size = 2.0 * logsumexp(step * gain) - logsumexp(2.0 * step * gain)
+            return float(np.exp(log_size)) - 0.5 * gain.size
+
+        step = 1.0 - done
+        if excess(step) < 0.0:
+            step = brentq(excess, 0.0, step, xtol=1e-300, rtol=1e-3)
+        done = 1.0 if step == 1.0 - done else done + step
+        log_weight = step * gain
+        weight = np.exp(log_weight - logsumexp(log_weight))
+        draws = draws[systematic(weight, weight.size, rng)]
+
+        def tempered(t: Array, share: float = done) -> Array:
+            low, high = first(t), second(t)
+            with np.errstate(invalid="ignore"):  # where both are zero
+                value = low + share * (high - low)
+            return np.where(np.isfinite(high), value, -np.inf)
+
+        draws = run_walkers(tempered, draws, local_moves(), 8, rng)[0][-1]
+        if done >= 1.0:
+            return draws

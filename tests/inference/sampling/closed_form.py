@@ -23,7 +23,7 @@ type LogProb = Callable[[Array], Array]
 
 def run(
     log_prob: LogProb, mean: Array, covariance: Array, seed: int = 1,
-    settings: SamplerSettings | None = None, born: Array | None = None,
+    settings: SamplerSettings | None = None, last_starts: Array | None = None,
 ) -> Draws:  # fmt: skip
     """Sample a density from a first guess of its location and scale."""
     mean = np.asarray(mean, dtype=float)
@@ -32,7 +32,7 @@ def run(
     names = tuple(f"x{i}" for i in range(mean.size))
     return sample_density(
         log_prob, [first], seeds, names, settings or SamplerSettings(),
-        rng=np.random.default_rng(seeds[0]), born=born,
+        rng=np.random.default_rng(seeds[0]), last_starts=last_starts,
     )  # fmt: skip
 
 

@@ -5,10 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.inference.diagnostics import Gate, GateReport, convergence, ess, hdi, judge, psis
+from calib.inference.diagnostics import (
+    Gate,
+    GateReport,
+    convergence,
+    ess,
+    hdi,
+    judge,
+    longest_autocorrelation_time,
+    psis,
+)
 from calib.inference.sampling import sampler as sampler_module
 from calib.inference.sampling.sampler import SamplerSettings
-from calib.inference.sampling.walkers import longest_tau
 from tests.inference.sampling.closed_form import linear, run
 
 NAMES = ("a", "b")
@@ -156,7 +164,7 @@ def test_going_to_and_fro_between_opposite_points_is_no_mixing(length: int) -> N
     chain = np.repeat(size, length, axis=0)
     chain[1::2] *= -1.0
     # 64 x 4000 steps give an autocorrelation time to a few per cent.
-    np.testing.assert_allclose(longest_tau(chain), length, rtol=0.15)
+    np.testing.assert_allclose(longest_autocorrelation_time(chain), length, rtol=0.15)
 
 
 def test_a_run_that_cannot_move_is_refused() -> None:

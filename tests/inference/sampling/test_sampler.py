@@ -29,7 +29,7 @@ from tests.inference.sampling.closed_form import (
     linear,
     run,
 )
-from tests.inference.sampling.test_mode import box
+from tests.inference.sampling.test_modes import box
 
 QUICK = SamplerSettings(steps=100, max_steps=100, keep=50)
 
@@ -138,7 +138,7 @@ def test_a_mode_that_only_walkers_know_is_sampled_in_its_proportion() -> None:
     born[:16, 0] += 40.0
     shares = []
     for settings in (SamplerSettings(max_steps=192), SamplerSettings()):
-        draws = run(log_prob, np.zeros(2), np.eye(2), settings=settings, born=born)
+        draws = run(log_prob, np.zeros(2), np.eye(2), settings=settings, last_starts=born)
         shares.append((draws.t[..., 0] > 20.0).mean())
         if settings.max_steps == 192:
             assert not draws.report.passed

@@ -1,0 +1,37 @@
+"""Tuned numbers of this room: unit; reason; the test that would notice a change."""
+
+# Likelihood
+TILE_CELLS = (
+    65_536  # rows times vectors; a few arrays of doubles in cache; tests/inference/likelihood
+)
+CHUNK_CELLS = (
+    200_000  # rows times vectors; bounds the memory of residuals; tests/inference/likelihood
+)
+
+# Search for modes
+MODE_STARTS = 64  # points; finds a mode of 1/6 of the prior's width in 4 dimensions; test_modes
+NEGLIGIBLE_NATS = 15.0  # nats below the highest mode; such a mode has no mass; test_modes
+SAME_MODE = 25.0  # squared standard distance; ascents that end so near are of one mode; test_modes
+
+# Proposal
+ROUND_SIZES = (60, 120, 250, 400)  # draws per (dimension + 5) of each round; test_proposal
+GOOD_EFFICIENCY = 0.9  # effective fraction; better proposals are not worth a round; test_proposal
+MOST_COMPONENTS = 16  # of a mixture about one mode; test_proposal
+FITTED_DRAWS = 6000  # draws; a fit to more is no better; test_proposal
+WIDENING = 1.07  # factor on scales; light tails cost more than heavy ones; test_sampler
+BROAD_SHARE = (0.08, 0.4)  # of draws from a broad component, trusted or not; test_sampler
+
+# Sampler
+ANNEALED = 512  # draws carried from the prior to the posterior; test_modes
+LONG_DATA = 5000  # distinct rows from which an evaluation is dear; benchmarks/million.py
+JUDGED = 4096  # draws per ensemble that the gate looks at; test_gate
+LEAST_STEPS = 32  # steps among these: of fewer, ESS comes out too large by a tenth; test_gate
+
+# Files
+MAX_CELLS = 8_000_000  # draws times rows of a group of posterior.nc; 64 MB; test_io
+
+# Estimators
+FLAT_PART = (
+    1e-6  # of the scatter; a parameter that moves less per prior sd is held; test_least_squares
+)
+SHORT_DATA = 4000  # rows that show where an optimum is; benchmarks/million.py
