@@ -6,6 +6,7 @@ import math
 import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -15,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from calib.batch.environment import Environment, sha256
-from calib.batch.pool import HERE, Pool
+from calib.batch.pool import HERE
 from calib.check import compare, verify
 from calib.check.compare import POSTERIORS, Job, count_drawn, flatten, verify_posterior
 from calib.check.outcome import Item, Outcome, Status, claim
@@ -256,7 +257,7 @@ def _problem(task: Task) -> Problem:
 
 
 def recompute_report(
-    manifest: Manifest, tasks: tuple[Task, ...], out: Path, progress: Progress, pool: Pool
+    manifest: Manifest, tasks: tuple[Task, ...], out: Path, progress: Progress, pool: Executor
 ) -> Study:
     """Work a report out again and write it into a new folder."""
     report = work_out(
@@ -342,7 +343,7 @@ _CHECKS: Mapping[str, Callable[[Any, Job], list[Item]]] = {
 
 
 def check(
-    folder: Path, *, quick: bool = False, progress: Progress | None = None, pool: Pool = HERE,
+    folder: Path, *, quick: bool = False, progress: Progress | None = None, pool: Executor = HERE,
     workers: int = 1,
 ) -> Outcome:  # fmt: skip
     """Compute a report, a run or a comparison again from its own folder and compare.
@@ -355,7 +356,7 @@ def check(
         Skip the sampling: hashes, data, priors and point estimates only.
     progress : callable, optional
         Called with what is being done, steps done and steps planned.
-    pool : Pool, optional
+    pool : Executor, optional
         Where a report is made again; what is found does not depend on it.
     workers : int
         Processes that leave rows out of a comparison.

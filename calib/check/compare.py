@@ -11,6 +11,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from calib.batch.environment import Environment
-from calib.batch.pool import HERE, Pool
+from calib.batch.pool import HERE
 from calib.check.outcome import ROUNDED, Item, Status, claim
 from calib.check.tolerances import (
     ARITHMETIC,
@@ -85,7 +86,7 @@ class Job:
     progress: Progress
     here: Environment
     quick: bool = False
-    pool: Pool = HERE
+    pool: Executor = HERE
     workers: int = 1
 
     def inside(self, name: str) -> Job:

@@ -70,9 +70,7 @@ def program() -> None:
         main()
     except SystemExit as ended:
         code = LOST if _is_lost(outputs) else ended.code
-        if ended.code == INTERRUPTED:
-            _end_server()
-        elif isinstance(ended.code, str) or _others_at_work():
+        if isinstance(ended.code, str) or _others_at_work():
             raise SystemExit(code) from None
         # The interpreter would take long to give back, one by one, what it holds.
         atexit._run_exitfuncs()
@@ -202,15 +200,7 @@ def was_interrupted() -> bool:
 def _stop(*_: object) -> None:
     """End while the commands are imported, where an exception would come out as any other."""
     os.write(2, f"calib: {STOPPED}\n".encode())
-    _end_server()
     os._exit(INTERRUPTED)
-
-
-def _end_server() -> None:
-    """End what processes are forked from, if it was begun: nothing is imported for that."""
-    end = getattr(sys.modules.get("calib.batch.pool"), "end_server", None)
-    if end is not None:
-        end()
 
 
 def _interrupt_again(usual: Callable[[Any], object], lost: Any) -> None:

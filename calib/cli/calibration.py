@@ -53,10 +53,9 @@ def report(
 ) -> None:
     """Calibrate, predict, validate and write a report folder with an index.html."""
     from calib.batch.folders import claimed
-    from calib.batch.pool import begin_imports, pool
+    from calib.batch.pool import pool
 
     ctx.with_resource(claimed(out, overwrite=overwrite))
-    begin_imports(workers)
     from dataclasses import replace
 
     from calib import SamplerSettings, read_table

@@ -115,9 +115,7 @@ def check(
     Ends with 0 where all is the same, 1 where something differs, 2 where it cannot be checked.
     """
     from calib.batch.plugins import load_files
-    from calib.batch.pool import begin_imports, pool
-
-    begin_imports(1 if quick else workers)
+    from calib.batch.pool import pool
     from calib.check.check import check as find
     from calib.cli.options import progress_bars
 

@@ -17,12 +17,6 @@ if TYPE_CHECKING:
 
     from calib.report.labels import Facts
 
-# What the processes that draw the page import.
-_PAGE = (
-    "calib.report.page.diagnosis", "calib.report.figures.gap",
-    "calib.report.figures.style", "PIL.Image",
-)  # fmt: skip
-
 
 def diagnose(
     ctx: typer.Context,
@@ -49,10 +43,9 @@ def diagnose(
     from functools import partial
 
     from calib.batch.folders import claimed, fresh_folder
-    from calib.batch.pool import begin_imports, pool
+    from calib.batch.pool import pool
 
     ctx.with_resource(claimed(out, overwrite=overwrite))
-    begin_imports(workers, _PAGE)
     from calib.batch.foreign import keep
     from calib.cli.options import progress_bars
     from calib.cli.simulators import keep_emulators, prepare_case, say
@@ -90,7 +83,7 @@ def diagnose(
     told = [say(what, emulation) for what, emulation in emulations]
     manifest = {"seed": seed, "command": opt.command()}
     own_files = [] if effects is None else [effects]
-    with pool(workers, _PAGE, own_files) as side:
+    with pool(workers, own_files) as side:
         found = find(given, seed, effects=considered, pool=side)
         keep("diagnosis", partial(write_diagnosis, found))
         from calib.report.page.diagnosis import begin_page

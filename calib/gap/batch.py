@@ -12,7 +12,7 @@ from typing import Any
 
 from calib.batch.environment import code_sha256, sha256
 from calib.batch.folders import read_folder
-from calib.batch.tasks import LateItems, run_folder_tasks
+from calib.batch.tasks import run_tasks
 from calib.errors import CalibError
 from calib.gap.case import NUMBER, Case, case_files, read_case, read_context
 from calib.gap.diagnose import Diagnosis, diagnose
@@ -199,10 +199,10 @@ def diagnose_cases(
         If there are diagnoses of other cases, or with another seed.
     """
     check_resumable(cases, out, seed)
-    outcome = run_folder_tasks(
-        partial(_diagnose, seed=seed),
-        LateItems({case.name: case for case in cases}, read_case),
-        out, workers=workers, scheduler=scheduler, progress=progress, announce=announce,
+    outcome = run_tasks(
+        partial(_diagnose, seed=seed), {case.name: case for case in cases}, out,
+        read=read_case, folders=True, workers=workers, scheduler=scheduler,
+        progress=progress, announce=announce,
     )  # fmt: skip
     return dict(outcome.failed)
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from concurrent.futures import Executor
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.batch.pool import HERE, Pool
+from calib.batch.pool import HERE
 from calib.batch.threads import one_thread
 from calib.data.quantities import OUTPUTS, columns_of, role_of
 from calib.gap.campaigns import MIN_FIELD_ROWS, Campaigns, campaigns
@@ -127,7 +128,7 @@ def diagnose(
     seed: int = 1,
     *,
     effects: Mapping[str, Effect] = EFFECTS,
-    pool: Pool = HERE,
+    pool: Executor = HERE,
 ) -> Diagnosis:
     """Find where a calibrated simulator misses, which effect it lacks, and what adding it gains.
 
@@ -139,7 +140,7 @@ def diagnose(
         Same seed, same numbers.
     effects : mapping of str to Effect, optional
         The effects to consider, by name.
-    pool : Pool, optional
+    pool : Executor, optional
         Where field rows are left out, if they have to be; the numbers do not depend on it.
 
     Returns
@@ -229,7 +230,7 @@ def screened_ranking(
 
 
 def with_unseen_rows(
-    found: Diagnosis, effects: Mapping[str, Effect] = EFFECTS, pool: Pool = HERE
+    found: Diagnosis, effects: Mapping[str, Effect] = EFFECTS, pool: Executor = HERE
 ) -> Diagnosis:
     """Judge how far a gap shrinks on rows that were left out, where there is nothing to predict."""
     data = found.data
@@ -292,7 +293,7 @@ def _without_context(
     return {"none": probability["none"], **inclusion_probability(probability)}
 
 
-def _left_out(found: Diagnosis, effects: Mapping[str, Effect], pool: Pool) -> dict[str, Array]:
+def _left_out(found: Diagnosis, effects: Mapping[str, Effect], pool: Executor) -> dict[str, Array]:
     """Predict each field row by a diagnosis that has not seen it, hypotheses chosen anew.
 
     Without other conditions to predict, this is how far the correction carries beyond the rows it

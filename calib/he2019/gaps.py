@@ -15,6 +15,7 @@ from __future__ import annotations
 import hashlib
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -25,7 +26,6 @@ import scipy
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from calib.batch.pool import Later, Pool
 from calib.batch.threads import one_thread
 from calib.data import Table, table_from_arrays, write_table
 from calib.data.quantities import OUTPUTS
@@ -266,17 +266,12 @@ class Unfitted:
 
 
 def begin_gaps(
-    seed: int, gaps: Sequence[PaperGap], pool: Pool
+    seed: int, gaps: Sequence[PaperGap], pool: Executor
 ) -> Callable[[Progress], tuple[FoundGap, ...]]:
     """Ask for the diagnoses of gaps and of their variants; return what waits for them."""
-
-    def ask(case: Case) -> Callable[..., Later[Any]]:
-        # Without new conditions rows are left out in turn, which takes five times as long.
-        return pool.submit_long if case.new_conditions is None else pool.submit
-
     asked = [
-        (gap, ask(gap.case)(_with_sd, gap.case, seed),
-         {name: ask(case)(diagnose, case, seed) for name, case in gap.variants.items()})
+        (gap, pool.submit(_with_sd, gap.case, seed),
+         {name: pool.submit(diagnose, case, seed) for name, case in gap.variants.items()})
         for gap in gaps
     ]  # fmt: skip
     planned = sum(1 + len(gap.variants) for gap in gaps)

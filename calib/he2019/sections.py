@@ -6,13 +6,13 @@ import math
 import re
 import shlex
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
 
-from calib.batch.pool import Pool
 from calib.gap.files import write_diagnosis
 from calib.he2019 import declared
 from calib.he2019.audit import (
@@ -242,7 +242,7 @@ class GapsSection(Section[tuple[FoundGap, ...]]):
     name, anchor, badge = "paper_gaps", "paper-gaps", "reconstructed data"
     heading = "Where the paper's own models miss"
 
-    def work_out(self, study: Study, pool: Pool, tell: Progress) -> tuple[FoundGap, ...]:
+    def work_out(self, study: Study, pool: Executor, tell: Progress) -> tuple[FoundGap, ...]:
         """Diagnose the gaps."""
         return begin_gaps(study.seed, self.gaps, pool)(tell)
 
@@ -276,7 +276,7 @@ class AuditSection(Section[Audit]):
     seeds: Seeds = field(default_factory=Seeds)
     name, anchor, heading = "audit", "audit", "Audit of the published tables"
 
-    def work_out(self, study: Study, pool: Pool, tell: Progress) -> Audit:
+    def work_out(self, study: Study, pool: Executor, tell: Progress) -> Audit:
         """Audit the tables, with the study's calibration of rut depth if it has one."""
         rut = study.successes.get("rut_depth")
         begun = begin_audit(study.seed, self.seeds, pool)

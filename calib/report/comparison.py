@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -19,7 +20,6 @@ from matplotlib.figure import Figure
 from pydantic import Field
 
 from calib.batch.environment import Environment
-from calib.batch.pool import Pool
 from calib.data import read_for_model, write_table
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
@@ -401,7 +401,7 @@ class StatedComparison(Section[Mapping[str, Any]]):
     document: Mapping[str, Any]
     name, anchor, heading = "comparison", "comparison", "Which model the data prefer"
 
-    def work_out(self, study: Study, pool: Pool, tell: Progress) -> Mapping[str, Any]:
+    def work_out(self, study: Study, pool: Executor, tell: Progress) -> Mapping[str, Any]:
         """Return the document."""
         return self.document
 
@@ -439,7 +439,7 @@ class ComparisonSection(Section[Comparison]):
     workers: int = 1
     name, anchor, heading = "comparison", "comparison", "Which model the data prefer"
 
-    def work_out(self, study: Study, pool: Pool, tell: Progress) -> Comparison:
+    def work_out(self, study: Study, pool: Executor, tell: Progress) -> Comparison:
         """Compare them; processes of its own leave rows out."""
         fitted, held = fitted_rows(self.task)
         return compare(

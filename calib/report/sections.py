@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from calib.batch.pool import HERE, Pool
+from calib.batch.pool import HERE
 from calib.data.files import plain_number
 from calib.data.registry import Registry
 from calib.report.numbers import format_number
@@ -41,7 +42,7 @@ class Target:
         Of the packages, for pages in the folder.
     pdf : bool
         Whether figures also come as PDF.
-    pool : Pool
+    pool : Executor
         Where figures are drawn.
     tell : callable
         Called with a step's name, the steps done and planned.
@@ -50,7 +51,7 @@ class Target:
     folder: Path
     versions: Mapping[str, str]
     pdf: bool = False
-    pool: Pool = HERE
+    pool: Executor = HERE
     tell: Progress = lambda what, done, planned: None
 
 
@@ -71,7 +72,7 @@ class Section[Part](ABC):
     badge: ClassVar[str] = ""
 
     @abstractmethod
-    def work_out(self, study: Study, pool: Pool, tell: Progress) -> Part:
+    def work_out(self, study: Study, pool: Executor, tell: Progress) -> Part:
         """Return what is found, given the study; random numbers follow from its seed."""
 
     @abstractmethod
@@ -120,7 +121,7 @@ class EmulatorSection(Section[Mapping[str, Document]]):
     documents: Mapping[str, Document]
     name, anchor, heading = "emulators", "emulators", "Emulators of slow simulators"
 
-    def work_out(self, study: Study, pool: Pool, tell: Progress) -> Mapping[str, Document]:
+    def work_out(self, study: Study, pool: Executor, tell: Progress) -> Mapping[str, Document]:
         """Return the documents."""
         return self.documents
 
@@ -207,7 +208,7 @@ def work_out(
     sections: Sequence[Section[Any]] = (),
     progress: Progress | None = None,
     workers: int = 1,
-    pool: Pool = HERE,
+    pool: Executor = HERE,
 ) -> Report:
     """Work out all that a report shows.
 
@@ -219,7 +220,7 @@ def work_out(
         Called with a step's name, the steps done and planned.
     workers : int
         Processes for leaving rows out, where outputs are worked out in this process.
-    pool : Pool, optional
+    pool : Executor, optional
         Where outputs and sections are worked out. The numbers depend neither on it nor on
         `workers`.
     """

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -15,7 +16,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from calib.batch.foreign import keep
-from calib.batch.pool import Pool
+from calib.batch.pool import HERE
 from calib.batch.threads import one_thread
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration, calibrate
@@ -102,7 +103,7 @@ class Study:
 def work_out_study(
     tasks: Sequence[Task],
     seed: int,
-    pool: Pool,
+    pool: Executor,
     *,
     settings: SamplerSettings | None = None,
     tell: Progress,
@@ -110,12 +111,12 @@ def work_out_study(
 ) -> Study:
     """Work every output out; see `calib.report.sections.work_out`."""
     began = time.perf_counter()
-    inner, inside = (tell, workers) if pool.here else (_silent, 1)
+    inner, inside = (tell, workers) if pool is HERE else (_silent, 1)
     pieces = {t.output: pool.submit(_attempt, t, seed, settings, inner, inside) for t in tasks}
     results = {}
     for i, (key, piece) in enumerate(pieces.items()):
         results[key] = piece.result()
-        if not pool.here:
+        if pool is not HERE:
             tell("outputs", i + 1, len(pieces))
     return Study(results, seed, time.perf_counter() - began)
 

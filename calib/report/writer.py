@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Mapping, Sequence
+from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 
 from calib.batch.environment import Environment, sha256
 from calib.batch.folders import fresh_folder
-from calib.batch.pool import HERE, Pool
+from calib.batch.pool import HERE
 from calib.data import Table, write_table
 from calib.data.files import read_text
 from calib.inference.estimators import GeneticSettings
@@ -83,7 +84,7 @@ def write_report(
     environment: Environment | None = None,
     pdf: bool = False,
     progress: Progress | None = None,
-    pool: Pool = HERE,
+    pool: Executor = HERE,
 ) -> Path:
     """Write a report folder, whole or not at all, and return the path of its ``index.html``.
 
@@ -101,7 +102,7 @@ def write_report(
         Where the manifest says the report was made: that of this process by default.
     pdf : bool
         Whether every figure also comes as PDF, for print.
-    pool : Pool, optional
+    pool : Executor, optional
         Where figures are drawn.
 
     Raises

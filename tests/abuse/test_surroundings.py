@@ -216,7 +216,7 @@ def test_a_disk_that_is_full_at_the_end_loses_nothing(monkeypatch: pytest.Monkey
 
 
 def test_another_process_leaves_what_it_finished(tmp_path: Path) -> None:
-    with suppress(KeyboardInterrupt), claimed(tmp_path / "out"), pool(2, modules=()) as side:
+    with suppress(KeyboardInterrupt), claimed(tmp_path / "out"), pool(2) as side:
         assert side.submit(keeps, "there").result() == "kept"
         unfinished.keep("here", write_here)
         raise KeyboardInterrupt
@@ -653,7 +653,7 @@ def test_a_simulator_imports_what_lies_beside_it(limit: str, tmp_path: Path) -> 
     path = write_helped(tmp_path / "a", 3.0, limit=limit)
     assert pulled(path) == pytest.approx(3.0 * 2.0 * 0.6 * 4.0 / 1000.0)
     # In another process too.
-    with pool(2, modules=(), files=[path]) as side:
+    with pool(2, files=[path]) as side:
         assert side.submit(pulled, path).result() == pulled(path)
 
 

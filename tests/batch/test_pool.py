@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import active_children, forkserver
+from collections.abc import Iterator
+from concurrent.futures import Executor
+from multiprocessing import active_children
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
+import psutil
 import pytest
 
 from calib.batch.pool import HERE, pool
 from calib.errors import CalibError
-
-# What most of these need imported: what a report does takes seconds, for each server anew.
-LIGHT = ("calib.errors",)
 
 
 def square(x: int) -> tuple[int, int]:
@@ -27,19 +28,14 @@ def fail(words: str) -> None:
     raise CalibError(words, hint="do")
 
 
-def die() -> None:
-    os._exit(9)
-
-
-def leave(path: Path) -> None:
-    path.write_text("there")
-
-
-def test_pieces_come_from_other_processes_in_the_order_they_are_asked_for() -> None:
+@pytest.fixture(scope="module")
+def two() -> Iterator[Executor]:
     with pool(2) as side:
-        assert not side.here
-        pieces = [side.submit(square, x) for x in range(5)]
-        results = [piece.result() for piece in pieces]
+        yield side
+
+
+def test_pieces_come_from_other_processes_in_the_order_they_are_asked_for(two: Executor) -> None:
+    results = [piece.result() for piece in [two.submit(square, x) for x in range(5)]]
     assert [value for value, _ in results] == [0, 1, 4, 9, 16]
     assert os.getpid() not in {pid for _, pid in results}
 
@@ -47,157 +43,69 @@ def test_pieces_come_from_other_processes_in_the_order_they_are_asked_for() -> N
 def test_one_worker_is_this_process_and_works_when_the_piece_is_wanted(tmp_path: Path) -> None:
     with pool(1) as side:
         assert side is HERE
-        piece = side.submit(leave, tmp_path / "file")
+        piece = side.submit((tmp_path / "file").write_text, "there")
         assert not (tmp_path / "file").exists()
-        piece.result()
+        assert piece.result() == piece.result() == 5
         assert (tmp_path / "file").exists()
         assert side.submit(square, 3).result() == (9, os.getpid())
 
 
+@pytest.mark.parametrize("here", [False, True])
+def test_what_goes_wrong_with_a_piece_is_raised_where_it_is_wanted(
+    here: bool, two: Executor
+) -> None:
+    side = HERE if here else two
+    wrong, fine = side.submit(fail, "mine"), side.submit(square, 2)
+    with pytest.raises(CalibError, match="mine"):
+        wrong.result()
+    assert fine.result()[0] == 4
+
+
+def started(before: list[BaseProcess]) -> list[BaseProcess]:
+    return [process for process in active_children() if process not in before]
+
+
 def test_an_interruption_ends_the_processes_at_their_work() -> None:
-    with pytest.raises(KeyboardInterrupt), pool(2, LIGHT) as side:  # noqa: PT012
-        side.submit(square, 2).result()
+    before = active_children()
+    with pytest.raises(KeyboardInterrupt), pool(2) as side:  # noqa: PT012
         side.submit(time.sleep, 600.0)
-        working = active_children()
+        working = started(before)
         raise KeyboardInterrupt
-    assert working
+    assert len(working) == 2
     for process in working:
         process.join(60.0)
-        assert process.exitcode
+        assert process.exitcode == -signal.SIGKILL
 
 
-def test_a_server_that_is_gone_hides_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One that an earlier pool ended, whose place no other has taken yet."""
-    gone = subprocess.Popen(["true"])
-    gone.wait()
-    monkeypatch.setattr("calib.batch.pool._serve", lambda: None)
-    monkeypatch.setattr(forkserver._forkserver, "_forkserver_pid", gone.pid)
-    with pytest.raises(CalibError, match="of the work"), pool(2, LIGHT):
-        raise CalibError("of the work")
-
-
-def test_an_interruption_while_the_last_pieces_are_waited_for_ends_the_processes(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """A piece that nobody waits for would keep a script from ending."""
-    orderly = ProcessPoolExecutor.shutdown
-
-    def interrupted(executor: ProcessPoolExecutor, wait: bool = True, **how: bool) -> None:
-        if wait:
-            raise KeyboardInterrupt
-        orderly(executor, wait, **how)
-
-    monkeypatch.setattr(ProcessPoolExecutor, "shutdown", interrupted)
-    with pytest.raises(KeyboardInterrupt), pool(2, LIGHT) as side:  # noqa: PT012
-        side.submit(square, 2).result()
-        side.submit(time.sleep, 600.0)
-        working = active_children()
-    assert working
-    for process in working:
+def test_a_process_that_dies_is_a_clear_error_and_ends_the_others() -> None:
+    before = active_children()
+    with pytest.raises(CalibError, match="a process died"), pool(2) as side:
+        side.submit(os._exit, 9).result()
+    for process in started(before):
         process.join(60.0)
-        assert process.exitcode
+        assert process.exitcode is not None
 
 
-def test_where_no_process_can_start_it_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    def short(*_: object) -> None:
-        raise OSError(24, "too many open files")
-
-    monkeypatch.setattr("calib.batch.pool._serve", short)
-    monkeypatch.setattr(ProcessPoolExecutor, "submit", short)
-    with pool(2, LIGHT) as side:
-        piece = side.submit(square, 2)
-        with pytest.raises(OSError, match="too many"):
-            piece.result()
-
-
-def test_what_waits_is_not_begun_after_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("calib.batch.pool._start", lambda *_: None)
-    asked: list[object] = []
-    monkeypatch.setattr(ProcessPoolExecutor, "submit", lambda _, work: asked.append(work))
-    with pytest.raises(CalibError, match="stop"), pool(2, LIGHT) as side:  # noqa: PT012
-        side.submit(square, 2)
-        raise CalibError("stop")
-    side.begun()
-    assert asked == []
-
-
-@pytest.mark.parametrize("workers", [1, 2])
-def test_what_goes_wrong_with_a_piece_is_raised_where_it_is_wanted(workers: int) -> None:
-    with pool(workers, LIGHT) as side:
-        wrong, fine = side.submit(fail, "mine"), side.submit(square, 2)
-        with pytest.raises(CalibError, match="mine"):
-            wrong.result()
-        assert fine.result()[0] == 4
-
-
-def test_a_process_that_dies_is_a_clear_error() -> None:
-    with pool(2, LIGHT) as side, pytest.raises(CalibError, match="a process died"):
-        side.submit(die).result()
-
-
-def test_a_death_that_the_executor_did_not_see_is_noticed(
-    monkeypatch: pytest.MonkeyPatch,
+def test_processes_end_with_the_one_that_waits_and_find_no_library_in_its_folder(
+    tmp_path: Path,
 ) -> None:
-    """While one waits, the executor is made to look at its processes again."""
-    monkeypatch.setattr("calib.batch.pool._LOOK_SECONDS", 0.05)
-    with pool(2, LIGHT) as side:
-        slow = side.submit(time.sleep, 0.4)
-        assert slow.result() is None
-        with pytest.raises(CalibError, match="a process died"):
-            side.submit(die).result()
-
-
-def test_what_was_asked_last_is_worked_out_here_until_the_processes_have_begun(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("calib.batch.pool._start", lambda *_: None)
-    with pool(2, LIGHT) as side:
-        first, long = side.submit(square, 1), side.submit_long(square, 2)
-        last = side.submit(square, 3)
-        assert side._last() is last  # type: ignore[comparison-overlap]
-        last.work()  # type: ignore[attr-defined]
-        assert last.result() == (9, os.getpid())
-        assert side._waiting == [long, first]
-        side.begun()
-        assert [piece.result()[0] for piece in (first, long)] == [1, 4]
-        assert os.getpid() not in {piece.result()[1] for piece in (first, long)}
-        side.help()  # nothing is left to do here
-        wrong = side.submit(fail, "over there")
-        with pytest.raises(CalibError, match="over there"):
-            wrong.result()
-
-
-def test_what_goes_wrong_here_is_raised_where_it_is_wanted(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("calib.batch.pool._start", lambda *_: None)
-    with pool(2, LIGHT) as side:
-        wrong = side.submit(fail, "mine")
-        side.help()
-        with pytest.raises(CalibError, match="mine"):
-            wrong.result()
-
-
-@pytest.mark.parametrize("safe", [None, "1"])
-def test_modules_of_the_working_folder_are_not_taken_for_libraries(
-    safe: str | None, tmp_path: Path
-) -> None:
-    """A user's own `colorsys.py`, say; what the processes start finds the environment as it was."""
+    """Neither its death nor a user's own `colorsys.py` beside the data must harm."""
     (tmp_path / "colorsys.py").write_text("raise SystemExit('the user's own')")
     script = tmp_path / "elsewhere" / "script.py"
     script.parent.mkdir()
     script.write_text(
-        "import os\n"
+        "import os, signal\n"
         "from calib.batch.pool import pool\n"
         "if __name__ == '__main__':\n"
-        "    with pool(2, ('colorsys',)) as side:\n"
-        "        print(side.submit(os.getenv, 'PYTHONSAFEPATH').result())\n"
-        "    print(os.getenv('PYTHONSAFEPATH'))\n"
+        "    with pool(2) as side:\n"
+        "        print(side.submit(eval, '__import__(\"colorsys\").__name__').result())\n"
+        "        print(side.submit(os.getpid).result(), flush=True)\n"
+        "        os.kill(os.getpid(), signal.SIGKILL)\n"
     )
-    own = {k: v for k, v in os.environ.items() if k != "PYTHONSAFEPATH"}
     ran = subprocess.run(
-        [sys.executable, script], cwd=tmp_path, capture_output=True, text=True, check=True,
-        env=own if safe is None else own | {"PYTHONSAFEPATH": safe},
-    )  # fmt: skip
-    assert ran.stdout.split() == [str(safe), str(safe)]
-    assert "the user" not in ran.stderr
+        [sys.executable, script], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    name, pid = ran.stdout.split()
+    assert (name, ran.returncode, "the user" in ran.stderr) == ("colorsys", -signal.SIGKILL, False)
+    # `run` has returned: nobody has its output open any more.
+    assert not psutil.pid_exists(int(pid)) or psutil.Process(int(pid)).status() == "zombie"

@@ -318,36 +318,3 @@ program()
     assert done.returncode == 130
     assert done.stderr.startswith("calib: interrupted; nothing was written. Start the same command")
     assert len(done.stderr.splitlines()) == 1
-
-
-@pytest.mark.parametrize("module", ["calib.cli.verbs", "calib.inference.problem"])
-def test_what_is_stopped_lets_go_of_a_pipe(module: str, tmp_path: Path) -> None:
-    """What its processes would be forked from is still importing, and has the same output."""
-    (tmp_path / "slow.py").write_text(
-        "import time\nopen('begun', 'w').close()\ntime.sleep(300.0)\n"
-    )
-    code = f"""
-import os, signal, sys, time
-from calib.batch.pool import begin_imports
-begin_imports(2, ["slow"])
-while not os.path.exists("begun"):
-    time.sleep(0.01)
-class Interrupted:
-    def find_spec(name, *_):
-        if name == {module!r}:
-            os.kill(os.getpid(), signal.SIGINT)
-sys.meta_path.insert(0, Interrupted)
-signal.signal(signal.SIGINT, signal.default_int_handler)
-from calib.cli import program
-program()
-"""
-    (tmp_path / "my.csv").write_text(example_csv("bekker"))
-    path = os.pathsep.join([str(tmp_path), *filter(None, sys.path)])
-    # It is read to the end, until none has it open.
-    done = subprocess.run(
-        [sys.executable, "-c", code, "fit", "my.csv", "--model", "bekker"], cwd=tmp_path,
-        capture_output=True, text=True, check=False, timeout=120,
-        env={**os.environ, "PYTHONPATH": path},
-    )  # fmt: skip
-    assert done.returncode == 130
-    assert "interrupted" in done.stderr

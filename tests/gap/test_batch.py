@@ -54,7 +54,7 @@ def test_every_case_has_its_diagnosis(done):
     assert sorted(p.name for p in done.iterdir()) == ["case-0", "case-1", "seconds.csv"]
 
 
-@pytest.mark.slow  # `tests/batch/tasks/test_cluster.py` has what it rests on
+@pytest.mark.slow  # `tests/batch/test_cluster.py` has what it rests on
 def test_two_workers_write_the_same_bytes(cases, done, tmp_path):
     assert diagnose_cases(cases, tmp_path / "two", 1, workers=2) == {}
     assert content(tmp_path / "two") == content(done)

@@ -21,7 +21,7 @@ from calib.batch.campaign.kinds import KINDS
 from calib.batch.campaign.plan import Plan
 from calib.batch.environment import sha256, versions
 from calib.batch.folders import check_folder, check_room, write_whole, writing
-from calib.batch.tasks import LateItems, check_names, failed_tasks, run_folder_tasks
+from calib.batch.tasks import check_names, failed_tasks, run_tasks
 from calib.errors import CalibError
 from calib.report.numbers import finite
 
@@ -249,8 +249,8 @@ def run_campaign(
         return task.kind, task.seed, records[task.name], KINDS[task.kind].load(task)
 
     try:
-        run_folder_tasks(
-            _work, LateItems(plan.tasks, load), results,
+        run_tasks(
+            _work, plan.tasks, results, read=load, folders=True,
             workers=workers, scheduler=scheduler, progress=progress, announce=announce,
         )  # fmt: skip
     finally:

@@ -8,10 +8,11 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
-from calib.batch.pool import HERE, Pool
+from calib.batch.pool import HERE
 from calib.batch.threads import one_thread
 from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict, finding
 from calib.he2019.audit.pull import (
@@ -102,7 +103,7 @@ def run_audit(
 
 
 def begin_audit(
-    seed: int, seeds: Seeds, pool: Pool, *, published: Published = PUBLISHED
+    seed: int, seeds: Seeds, pool: Executor, *, published: Published = PUBLISHED
 ) -> Callable[[Calibration | None, Progress], Audit]:
     """Ask for what takes long, the parameters as for `run_audit`; return what waits for it."""
     searches = begin_convergence(published, seed, seeds, pool)

@@ -10,13 +10,13 @@ of each pressure and needs the slips, so it is repeated with other shifts of zer
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from itertools import product
 
 import numpy as np
 from scipy.optimize import minimize
 
-from calib.batch.pool import Pool
 from calib.batch.threads import one_thread
 from calib.data import Table
 from calib.he2019.audit.bounds import (
@@ -104,7 +104,7 @@ def printed_settings(published: Published) -> GeneticSettings:
 
 
 def begin_convergence(
-    published: Published, seed: int, seeds: Seeds, pool: Pool
+    published: Published, seed: int, seeds: Seeds, pool: Executor
 ) -> Callable[[Progress], GeneticStudy]:
     """Ask for the searches over seeds, on the reconstructed data; return what waits for them."""
     settings = printed_settings(published)

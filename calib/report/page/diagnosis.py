@@ -6,13 +6,14 @@ import math
 import pickle
 import shlex
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
-from calib.batch.pool import HERE, Pool
+from calib.batch.pool import HERE
 from calib.gap.campaigns import OutputData
 from calib.gap.diagnose import NAMED, Diagnosis, placebos
 from calib.gap.effects.dependence import PREFIX
@@ -373,12 +374,12 @@ def write_page(found: Diagnosis, folder: Path, manifest: Mapping[str, Any]) -> N
 
 
 def begin_page(
-    found: Diagnosis, manifest: Mapping[str, Any], *, pool: Pool = HERE
+    found: Diagnosis, manifest: Mapping[str, Any], *, pool: Executor = HERE
 ) -> Callable[[Path], None]:
     """Ask for the page of a diagnosis; return what waits for it and writes it into a folder."""
     # Once for all pieces: it takes longer than to hand it over. Here an effect of a script's own
     # may be in it, which cannot be pickled.
-    packed = found if pool.here else pickle.dumps(found)
+    packed = found if pool is HERE else pickle.dumps(found)
     halves = [pool.submit(_drawn, packed, half) for half in (True, False)]
 
     def write(folder: Path) -> None:

@@ -19,6 +19,15 @@ def draw(item: int) -> dict[str, object]:
     return {"item": item, "value": float(generator(7, "draw", item).standard_normal())}
 
 
+def draw_even(item: int) -> dict[str, object]:
+    return draw(item) if fail_on_odd(item) else {}
+
+
+def versions() -> dict[str, str]:
+    """Others on a worker than here."""
+    return {"numpy": "here" if "pytest" in sys.modules else "there"}
+
+
 def files(item: int) -> dict[str, str | bytes]:
     return {"text.txt": f"{item}\n", "deep/er/data.bin": bytes([item])}
 
@@ -45,18 +54,10 @@ def not_json(item: int) -> dict[str, object]:
     return {"nan": float("nan")} if item == 0 else {"array": np.zeros(2)}
 
 
-def die(item: tuple[str, int]) -> dict[str, int]:
-    """Take the worker down on an item named so."""
-    kind, value = item
-    if kind == "deadly":
-        os.kill(os.getpid(), signal.SIGKILL)
-    return {"value": value}
-
-
-def die_once(item: tuple[str, str, int]) -> dict[str, int]:
-    """Take the worker down the first time, of which a file is the memory."""
-    kind, memory, value = item
-    if kind == "deadly" and not Path(memory).exists():
+def die(item: tuple[str, str, int]) -> dict[str, int]:
+    """Take the worker down, always or once, of which a file is the memory."""
+    when, memory, value = item
+    if when == "always" or (when == "once" and not Path(memory).exists()):
         Path(memory).touch()
         os.kill(os.getpid(), signal.SIGKILL)
     return {"value": value}
