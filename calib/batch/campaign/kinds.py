@@ -2,13 +2,13 @@
 
 A kind is a table of the plan, the tasks it stands for, and their work: fits, diagnoses, challenge
 cases (made by the repository's test bench, which a wheel does not have) and replicates of
-simulation-based calibration. Another kind is a class here and a line at the end.
+simulation-based calibration. Another kind is a table, three functions and a line at the end.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from itertools import product
@@ -21,7 +21,6 @@ import numpy as np
 from pydantic import Field
 
 from calib.batch.campaign.kind import (
-    EMULATION,
     Emulated,
     Kind,
     Place,
@@ -61,11 +60,17 @@ from calib.validation.replicate import Item, replicate
 from calib.validation.sbc import SETTINGS, chosen_models
 from calib.validation.validate import validate_held_out
 
-# What is run of a slow simulator does not depend on a task's own stream: it is what
-# `calib fit` runs by default, so that neither runs anything twice.
-_FIT_EMULATION_SEED = 2019
+SHIPPED, NOTHING = "shipped", "nothing"  # in a list of prior files, and of rows to hold out
 
-SHIPPED, NOTHING = "shipped", "nothing"
+
+def _files_of(write: Callable[[Path], object]) -> dict[str, bytes]:
+    """Return the files that a function writes into a folder."""
+    with TemporaryDirectory() as scratch:
+        write(Path(scratch))
+        return read_folder(Path(scratch))
+
+
+# Fits
 
 
 class FitSection(Section):
@@ -74,13 +79,15 @@ class FitSection(Section):
     data: list[str] = Field(min_length=1, description="a list of CSV files, patterns allowed")
     models: list[str] = Field(min_length=1, description="a list of models (see `calib models`)")
     priors: list[str] = Field(
-        default=[SHIPPED], min_length=1,
+        default=[SHIPPED],
+        min_length=1,
         description=f"a list of prior files, each for one of the models, and {SHIPPED!r}",
-    )  # fmt: skip
+    )
     hold_out: list[str] = Field(
-        default=[NOTHING], min_length=1,
+        default=[NOTHING],
+        min_length=1,
         description=f"a list of COLUMN=VALUE, the rows to hold out, and {NOTHING!r}",
-    )  # fmt: skip
+    )
     max_steps: int = Field(
         default=25_600, ge=100, description="100 or more steps, where extending the chains stops"
     )
@@ -94,82 +101,28 @@ class FitSection(Section):
 type FitItem = tuple[Problem, Table | None, SamplerSettings, bool, Emulated | None]
 
 
-class Fit(Kind[FitSection, FitItem]):
-    """Calibrate one model on one file, as `calib fit` does."""
-
-    name = "fit"
-    section = FitSection
-
-    def plan(self, section: FitSection, place: Place) -> Iterator[Planned]:
-        """Yield a task for each file, model, prior file and hold-out."""
-        priors = _priors(section, place)
-        with place.telling("hold_out"):
-            for text in section.hold_out:
-                _held(text)
-        for path, model in product(place.find("data", section.data), section.models):
-            for (prior, prior_path), out in product(priors[model], section.hold_out):
-                yield Planned(
-                    f"{place.word(path)}.{model}.{word(prior)}.{word(out)}",
-                    {
-                        "data": place.name(path), "model": model, "priors": prior,
-                        "hold_out": out, "max_steps": section.max_steps,
-                        "posteriors": section.posteriors, **simulators_of([model]),
-                    },
-                    {"data": path} | ({"priors": prior_path} if prior_path else {}),
-                )  # fmt: skip
-
-    def load(self, task: Task) -> FitItem:
-        """Read the file and bind the model to it; emulate its simulator if that has to be."""
-        model = get_model(task.settings["model"])
-        kept = _held(task.settings["hold_out"])
-        fitted, held = read_and_split(task.inputs["data"], (*model.conditions, model.output), kept)
-        problem = build_problem(model.name, fitted, task.inputs.get("priors"))
-        settings = SamplerSettings(max_steps=task.settings["max_steps"])
-        made: Emulated | None = None
-        if slow_simulator(model.name) is not None:
-            emulation = emulated(
-                problem, _FIT_EMULATION_SEED, elsewhere=[] if held is None else [held]
-            )
-            problem, made = emulation.problem, Emulated.of(emulation)
-        return problem, held, settings, task.settings["posteriors"], made
-
-    def work(self, item: FitItem, seed: int) -> Work:
-        """Sample the posterior, and score it on the rows that were held out."""
-        problem, held, settings, posterior, emulation = item
-        model = problem.bound.model.name
-        point = estimate(problem, "least_squares", generator(seed, model, "least_squares"))
-        calibration = calibrate(problem, seed, estimates=(point,), settings=settings)
-        numbers = _fit_numbers(calibration)
-        validation = None if held is None else validate_held_out(calibration, held)
-        fails = () if emulation is None else emulation.numbers.get("reasons", ())
-        judged = verdict(calibration, validation, emulator_fails=fails)
-        numbers["verdict"] = judged.headline
-        files = dict(_run_folder(calibration, judged)) if posterior else {}
-        if emulation is not None:
-            # A posterior under an emulator that is too far off is not to be used either.
-            numbers["converged"] = numbers["converged"] and emulation.passed
-            numbers["emulator"] = emulation.numbers
-            files[EMULATION] = emulation_file([emulation])
-        if judged.warnings:
-            numbers["warnings"] = " | ".join(judged.warnings)
-        if problem.table.label:
-            numbers["data_label"] = problem.table.label
-        if validation is not None:
-            scores = validation.scores
-            numbers["held_out"] = {
-                "rows": scores.n, "rmse": scores.rmse,
-                "crps": scores.crps if isfinite(scores.crps) else None,
-                "in_90_percent_band": scores.coverage[0.9].hits,
+def _plan_fits(section: FitSection, place: Place) -> Iterator[Planned]:
+    """Yield a task for each file, model, prior file and hold-out."""
+    priors = _priors(section, place)
+    with place.naming("hold_out"):
+        for text in section.hold_out:
+            _held(text)
+    for path, model in product(place.find("data", section.data), section.models):
+        for (prior, prior_path), out in product(priors[model], section.hold_out):
+            settings = {
+                "data": place.name(path), "model": model, "priors": prior, "hold_out": out,
+                "max_steps": section.max_steps, "posteriors": section.posteriors,
+                **simulators_of([model]),
             }  # fmt: skip
-        return Work(numbers, files)
+            inputs = {"data": path} | ({"priors": prior_path} if prior_path else {})
+            yield f"{place.word(path)}.{model}.{word(prior)}.{word(out)}", settings, inputs
 
 
 def _priors(section: FitSection, place: Place) -> dict[str, list[tuple[str, Path | None]]]:
     """Return names and paths of the prior files of each model."""
-    with place.telling("models"):
-        found: dict[str, list[tuple[str, Path | None]]] = {
-            get_model(m).name: [] for m in section.models
-        }
+    found: dict[str, list[tuple[str, Path | None]]]
+    with place.naming("models"):
+        found = {get_model(m).name: [] for m in section.models}
     for name in section.priors:
         if name == SHIPPED:
             for model, files in found.items():
@@ -182,16 +135,17 @@ def _priors(section: FitSection, place: Place) -> dict[str, list[tuple[str, Path
         if model not in found:
             raise CalibError(
                 f"{name} holds priors of {model}, which is not fitted",
-                where=f"{place.where}, priors", expected=", ".join(found),
+                where=f"{place.where}, priors",
+                expected=", ".join(found),
                 hint="add the model, or leave the file out",
-            )  # fmt: skip
+            )
         found[model].append((place.name(path), path))
-    bare = [model for model, files in found.items() if not files]
-    if bare:
+    if bare := [model for model, files in found.items() if not files]:
         raise CalibError(
-            f"no prior file is for {', '.join(bare)}", where=f"{place.where}, priors",
+            f"no prior file is for {', '.join(bare)}",
+            where=f"{place.where}, priors",
             hint=f"add {SHIPPED!r} to the list, or a file for each model",
-        )  # fmt: skip
+        )
     return found
 
 
@@ -199,36 +153,75 @@ def _held(text: str) -> HoldOut | None:
     return None if text == NOTHING else HoldOut.parse(text)
 
 
-def _fit_numbers(calibration: Calibration) -> dict[str, Any]:
+def _load_fit(task: Task) -> FitItem:
+    """Read the file and bind the model to it; emulate its simulator if that has to be."""
+    model = get_model(task.settings["model"])
+    kept = _held(task.settings["hold_out"])
+    fitted, held = read_and_split(task.inputs["data"], (*model.conditions, model.output), kept)
+    problem = build_problem(model.name, fitted, task.inputs.get("priors"))
+    made: Emulated | None = None
+    if slow_simulator(model.name) is not None:
+        # With the seed of `calib fit`, not the task's: neither runs anything twice.
+        emulation = emulated(problem, 2019, elsewhere=[] if held is None else [held])
+        problem, made = emulation.problem, Emulated.of(emulation)
+    settings = SamplerSettings(max_steps=task.settings["max_steps"])
+    return problem, held, settings, task.settings["posteriors"], made
+
+
+def _fit(item: FitItem, seed: int) -> Work:
+    """Sample the posterior, as `calib fit` does, and score it on the rows that were held out."""
+    problem, held, settings, posterior, emulation = item
+    model = problem.bound.model.name
+    point = estimate(problem, "least_squares", generator(seed, model, "least_squares"))
+    calibration = calibrate(problem, seed, estimates=(point,), settings=settings)
     report = calibration.draws.report
-    return {
-        "model": calibration.problem.bound.model.name,
-        "rows": len(calibration.problem.table),
+    shown = ("unit", "mean", "sd", "median", "hdi_lower", "hdi_upper", "sd_ratio")
+    numbers: dict[str, Any] = {
+        "model": model,
+        "rows": len(problem.table),
         "converged": report.passed,
         "rhat": float(report.rhat.max()),
         "ess": float(min(report.ess_bulk.min(), report.ess_tail.min())),
         "log_evidence": calibration.draws.log_evidence,
         "posterior": {
-            s.name: {key: value for key, value in asdict(s).items() if key in _SHOWN}
-            for s in calibration.summary.values()
+            s.name: {key: getattr(s, key) for key in shown} for s in calibration.summary.values()
         },
     }
+    validation = None if held is None else validate_held_out(calibration, held)
+    fails = () if emulation is None else emulation.numbers.get("reasons", ())
+    judged = verdict(calibration, validation, emulator_fails=fails)
+    numbers["verdict"] = judged.headline
+    files: dict[str, str | bytes] = {}
+    if posterior:
+        # How long it took stands elsewhere: without it, equal posteriors are equal files.
+        timeless = replace(calibration, draws=replace(calibration.draws, seconds=0.0))
+        run = _files_of(lambda folder: _keep_run(timeless, judged, folder))
+        files |= {f"run/{name}": data for name, data in run.items()}
+    if emulation is not None:
+        numbers["converged"] = report.passed and emulation.numbers["passed"]
+        numbers["emulator"] = emulation.numbers
+        files |= emulation_file([emulation])
+    if judged.warnings:
+        numbers["warnings"] = " | ".join(judged.warnings)
+    if problem.table.label:
+        numbers["data_label"] = problem.table.label
+    if validation is not None:
+        scores = validation.scores
+        numbers["held_out"] = {
+            "rows": scores.n,
+            "rmse": scores.rmse,
+            "crps": scores.crps if isfinite(scores.crps) else None,
+            "in_90_percent_band": scores.coverage[0.9].hits,
+        }
+    return numbers, files
 
 
-_SHOWN = ("unit", "mean", "sd", "median", "hdi_lower", "hdi_upper", "sd_ratio")
+def _keep_run(calibration: Calibration, judged: Verdict, folder: Path) -> None:
+    save_calibration(calibration, folder)
+    keep_verdict(judged, folder)
 
 
-def _run_folder(calibration: Calibration, judged: Verdict) -> Mapping[str, str | bytes]:
-    # How long it took stands elsewhere: without it, equal posteriors are equal files.
-    calibration = replace(calibration, draws=replace(calibration.draws, seconds=0.0))
-    with TemporaryDirectory() as scratch:
-        save_calibration(calibration, Path(scratch))
-        keep_verdict(judged, Path(scratch))
-        return {f"run/{name}": data for name, data in read_folder(Path(scratch)).items()}
-
-
-# As for `calib diagnose` by default.
-_CASE_EMULATION_SEED = 1
+# Diagnoses
 
 
 class DiagnoseSection(Section):
@@ -250,97 +243,90 @@ class DiagnoseSection(Section):
 type DiagnosisItem = tuple[Case, Mapping[str, bytes], bool, tuple[Emulated, ...]]
 
 
-class Diagnose(Kind[DiagnoseSection, DiagnosisItem]):
-    """Diagnose one case, as `calib diagnose` does."""
-
-    name = "diagnose"
-    section = DiagnoseSection
-
-    def plan(self, section: DiagnoseSection, place: Place) -> Iterator[Planned]:
-        """Yield a task for each case folder."""
-        extra: dict[str, Path] = {}
-        if section.effects is not None:
-            path = place.file("effects", section.effects)
-            extra["effects"] = path
-            for name, effect in load_effects(path).items():
-                if effect.prior_file is not None:
-                    extra[f"effects, {name}.toml"] = effect.prior_file
-        for case in place.find("cases", section.cases, holding="case.toml"):
-            content, files = case_files(case)
-            models = content.get("models")
-            settings = {
-                "case": place.name(case), "effects": section.effects, "pages": section.pages,
-                **simulators_of(models.values() if isinstance(models, dict) else ()),
-            }  # fmt: skip
-            yield Planned(place.word(case), settings, files | extra)
-
-    def load(self, task: Task) -> DiagnosisItem:
-        """Read the case; emulate simulators that have to be."""
-        effects = {
-            path.name: path.read_bytes()
-            for label, path in task.inputs.items()
-            if label.startswith("effects")
-        }
-        path = task.inputs["case.toml"]
-        case = read_case(path.parent)
-        return case, effects, task.settings["pages"], _emulated_case(case, _CASE_EMULATION_SEED)
-
-    def work(self, item: DiagnosisItem, seed: int) -> Work:
-        """Diagnose it."""
-        case, effects, page, emulated = item
-        with _effects(effects) as own, _in_place(emulated):
-            found = diagnose(case, seed, effects={**EFFECTS, **own})
-            files: dict[str, str | bytes] = {**written(found, effects)}
-            files |= _page(found, seed) if page else {}
-        numbers = diagnosis_numbers(found)
-        if case.label:
-            numbers["data_label"] = case.label
-        if emulated:
-            # A verdict under an emulator that is too far off is not to be used.
-            numbers |= {} if all(e.passed for e in emulated) else {"converged": False}
-            numbers["emulator"] = {e.model.name: e.numbers for e in emulated}
-            files |= {EMULATION: emulation_file(emulated), **_emulators(emulated)}
-        return Work(numbers, files)
+def _plan_diagnoses(section: DiagnoseSection, place: Place) -> Iterator[Planned]:
+    """Yield a task for each case folder."""
+    extra: dict[str, Path] = {}
+    if section.effects is not None:
+        path = place.file("effects", section.effects)
+        extra["effects"] = path
+        for name, effect in load_effects(path).items():
+            if effect.prior_file is not None:
+                extra[f"effects, {name}.toml"] = effect.prior_file
+    for case in place.find("cases", section.cases, holding="case.toml"):
+        content, files = case_files(case)
+        models = content.get("models")
+        settings = {
+            "case": place.name(case), "effects": section.effects, "pages": section.pages,
+            **simulators_of(models.values() if isinstance(models, dict) else ()),
+        }  # fmt: skip
+        yield place.word(case), settings, files | extra
 
 
-def _emulated_case(case: Case, seed: int) -> tuple[Emulated, ...]:
+def _load_diagnosis(task: Task) -> DiagnosisItem:
+    """Read the case; emulate simulators that have to be."""
+    effects = {
+        path.name: path.read_bytes()
+        for label, path in task.inputs.items()
+        if label.startswith("effects")
+    }
+    case = read_case(task.inputs["case.toml"].parent)
     others = [] if case.new_conditions is None else [case.new_conditions]
-    found = []
+    made = []
     for output, model in case.models.items():
         column = OUTPUTS[output]
         if slow_simulator(model) is None or column not in case.lab or column not in case.field:
             continue
         lab, field = (t.take(np.isfinite(t[column])) for t in (case.lab, case.field))
-        made = emulated_for_both(
-            model, lab, field, seed, priors=case.priors.get(output), elsewhere=others
+        # With the seed of `calib diagnose`, not the task's: neither runs anything twice.
+        both = emulated_for_both(
+            model, lab, field, 1, priors=case.priors.get(output), elsewhere=others
         )
-        found.append(Emulated.of(*made))
-    return tuple(found)
+        made.append(Emulated.of(*both))
+    return case, effects, task.settings["pages"], tuple(made)
+
+
+def _diagnose(item: DiagnosisItem, seed: int) -> Work:
+    """Diagnose a case, as `calib diagnose` does."""
+    case, effects, page, made = item
+    with _effects(effects) as own, _in_place(made):
+        found = diagnose(case, seed, effects={**EFFECTS, **own})
+        files: dict[str, str | bytes] = {**written(found, effects)}
+        if page:
+            files |= _files_of(lambda folder: write_page(found, folder, {"seed": seed}))
+    numbers = diagnosis_numbers(found)
+    if case.label:
+        numbers["data_label"] = case.label
+    if made:
+        # A verdict under an emulator that is too far off is not to be used.
+        numbers |= {} if all(e.numbers["passed"] for e in made) else {"converged": False}
+        numbers["emulator"] = {e.model.name: e.numbers for e in made}
+        files |= emulation_file(made)
+        # To predict from the diagnosis.
+        kept = _files_of(lambda folder: _keep_emulators(made, folder))
+        files |= {f"emulators/{name}": data for name, data in kept.items()}
+    return numbers, files
 
 
 @contextmanager
-def _in_place(emulated: Sequence[Emulated]) -> Iterator[None]:
+def _in_place(made: Sequence[Emulated]) -> Iterator[None]:
     """Let models be their emulators, in this process and for this task."""
-    before = [MODELS[e.model.name] for e in emulated if e.model.name in MODELS]
+    before = [MODELS[e.model.name] for e in made if e.model.name in MODELS]
     try:
-        for e in emulated:
+        for e in made:
             MODELS.discard(e.model.name)
             MODELS.add(e.model)
         yield
     finally:
-        for e in emulated:
+        for e in made:
             MODELS.discard(e.model.name)
         for model in before:
             MODELS.add(model)
 
 
-def _emulators(emulated: Sequence[Emulated]) -> dict[str, bytes]:
-    """Return the emulators as files, to predict from the diagnosis."""
-    with TemporaryDirectory() as scratch:
-        for e in emulated:
-            if (emulator := emulator_of(e.model)) is not None:
-                save_emulator(emulator, e.model.name, Path(scratch) / f"{e.model.name}.npz")
-        return {f"emulators/{name}": data for name, data in read_folder(Path(scratch)).items()}
+def _keep_emulators(made: Sequence[Emulated], folder: Path) -> None:
+    for e in made:
+        if (emulator := emulator_of(e.model)) is not None:
+            save_emulator(emulator, e.model.name, folder / f"{e.model.name}.npz")
 
 
 @contextmanager
@@ -351,12 +337,6 @@ def _effects(files: Mapping[str, bytes]) -> Iterator[Mapping[str, Effect]]:
         for path in paths:
             path.write_bytes(files[path.name])
         yield load_effects(paths[0]) if paths else {}
-
-
-def _page(found: Diagnosis, seed: int) -> dict[str, bytes]:
-    with TemporaryDirectory() as scratch:
-        write_page(found, Path(scratch), {"seed": seed})
-        return read_folder(Path(scratch))
 
 
 def diagnosis_numbers(found: Diagnosis) -> dict[str, Any]:
@@ -373,13 +353,19 @@ def diagnosis_numbers(found: Diagnosis) -> dict[str, Any]:
         "unknown": ranking.probability.get("unknown"),
         "shrink": {
             output: {
-                "rmse_before": s.rmse_before, "rmse_after": s.rmse_after, "fraction": s.fraction,
-                "lower": s.interval[0], "upper": s.interval[1],
+                "rmse_before": s.rmse_before,
+                "rmse_after": s.rmse_after,
+                "fraction": s.fraction,
+                "lower": s.interval[0],
+                "upper": s.interval[1],
             }
             for output, s in found.shrink.items()
         },
         "warnings": len(found.warnings),
-    }  # fmt: skip
+    }
+
+
+# Simulation-based calibration
 
 
 class SbcSection(Section):
@@ -390,53 +376,50 @@ class SbcSection(Section):
         ge=0, description="0 or a positive whole number: which campaigns are drawn"
     )
     models: list[str] = Field(
-        default=chosen_models(), min_length=1,
+        default=chosen_models(),
+        min_length=1,
         description="a list of models, see `calib models`; by default all that are not slow",
-    )  # fmt: skip
+    )
 
 
-class Sbc(Kind[SbcSection, Item]):
-    """One replicate, that of `calib sbc --seed DRAW_SEED`, which judges them all together."""
-
-    name = "sbc"
-    section = SbcSection
-
-    def plan(self, section: SbcSection, place: Place) -> Iterator[Planned]:
-        """Yield a task for each replicate."""
-        with place.telling("models"):
-            names = [get_model(name).name for name in section.models]
-        for model in names:
-            if slow_simulator(model) is not None:
-                # Its truths are runs, and so it is emulated on the way: for one process at a time.
-                raise CalibError(
-                    f"the simulator behind {model} is emulated for every replicate, which a "
-                    "campaign cannot do side by side", where=f"{place.where}, models",
-                    expected="closed forms, and simulators with emulate = false",
-                    hint=f"use calib sbc --model {model} --data CSV, which spreads the runs "
-                    "themselves over --workers",
-                )  # fmt: skip
-            for i in range(section.simulations):
-                yield Planned(
-                    f"{model}-{i:04d}",
-                    {"model": model, "index": i, "draw_seed": section.draw_seed,
-                     "sampler": asdict(SETTINGS)},
-                )  # fmt: skip
-
-    def load(self, task: Task) -> Item:
-        """Return what the replicate needs."""
-        s = task.settings
-        return Item(s["model"], s["index"], s["draw_seed"], SETTINGS)
-
-    def work(self, item: Item, seed: int) -> Work:
-        """Run the replicate; its record is what `calib sbc` keeps of it."""
-        record = replicate(item)
-        numbers = {key: record[key] for key in ("model", "converged", "steps", "extended")}
-        # As a fraction of the draws: uniform between 0 and 1 if all is right.
-        numbers |= {"rank": {name: rank / n for name, (rank, n) in record["ranks"].items()}}
-        return Work(numbers, {"replicate.json": json.dumps(record, indent=1) + "\n"})
+def _plan_sbc(section: SbcSection, place: Place) -> Iterator[Planned]:
+    """Yield a task for each replicate of `calib sbc --seed DRAW_SEED`, which judges them all."""
+    with place.naming("models"):
+        names = [get_model(name).name for name in section.models]
+    for model in names:
+        if slow_simulator(model) is not None:
+            # Its truths are runs, and so it is emulated on the way: for one process at a time.
+            raise CalibError(
+                f"the simulator behind {model} is emulated for every replicate, which a campaign "
+                "cannot do side by side",
+                where=f"{place.where}, models",
+                expected="closed forms, and simulators with emulate = false",
+                hint=f"use calib sbc --model {model} --data CSV, which spreads the runs "
+                "themselves over --workers",
+            )
+        for i in range(section.simulations):
+            settings = {
+                "model": model, "index": i, "draw_seed": section.draw_seed,
+                "sampler": asdict(SETTINGS),
+            }  # fmt: skip
+            yield f"{model}-{i:04d}", settings, {}
 
 
-_TABLE = "[[challenge]]"
+def _load_sbc(task: Task) -> Item:
+    s = task.settings
+    return Item(s["model"], s["index"], s["draw_seed"], SETTINGS)
+
+
+def _sbc(item: Item, seed: int) -> Work:
+    """Run the replicate; its record is what `calib sbc` keeps of it."""
+    record = replicate(item)
+    numbers = {key: record[key] for key in ("model", "converged", "steps", "extended")}
+    # As a fraction of the draws: uniform between 0 and 1 if all is right.
+    numbers |= {"rank": {name: rank / n for name, (rank, n) in record["ranks"].items()}}
+    return numbers, {"replicate.json": json.dumps(record, indent=1) + "\n"}
+
+
+# Challenge cases
 
 
 class ChallengeSection(Section):
@@ -456,70 +439,66 @@ class ChallengeSection(Section):
 type ChallengeItem = tuple[np.random.SeedSequence, Literal["easy", "hard"], str, str]
 
 
-class Challenge(Kind[ChallengeSection, ChallengeItem]):
-    """Make, diagnose and mark one case.
+def _plan_challenge(section: ChallengeSection, place: Place) -> Iterator[Planned]:
+    """Yield a task for each case."""
+    with from_the_bench(place.where):
+        from challenge.make import case_jobs
+
+    tiers: tuple[Any, ...] = ("easy", "hard") if section.tier == "both" else (section.tier,)
+    jobs, _ = case_jobs(section.draw_seed, section.cases, tiers, section.null_fraction)
+    for name, (own, tier, truth) in jobs.items():
+        settings = {
+            "draw_seed": section.draw_seed, "spawn_key": list(own.spawn_key), "tier": tier,
+            "truth": truth, "bench": _bench(),
+        }  # fmt: skip
+        yield name, settings, {}
+
+
+def _load_challenge(task: Task) -> ChallengeItem:
+    s = task.settings
+    own = np.random.SeedSequence(s["draw_seed"], spawn_key=tuple(s["spawn_key"]))
+    return own, s["tier"], s["truth"], s["bench"]
+
+
+def _challenge(item: ChallengeItem, seed: int) -> Work:
+    """Make a case, diagnose its files, and mark the diagnosis with its key.
 
     The cases are those of `calib challenge make --seed DRAW_SEED`, but their answers lie beside
     the diagnoses: this is for figures over many cases, not for a test that others should believe.
     """
+    with from_the_bench("[[challenge]]"):
+        from challenge.answers import read_answer
+        from challenge.make import make_case
 
-    name = "challenge"
-    section = ChallengeSection
-
-    def plan(self, section: ChallengeSection, place: Place) -> Iterator[Planned]:
-        """Yield a task for each case."""
-        with from_the_bench(place.where):
-            from challenge.make import case_jobs
-
-        tiers: tuple[Any, ...] = ("easy", "hard") if section.tier == "both" else (section.tier,)
-        jobs, _ = case_jobs(section.draw_seed, section.cases, tiers, section.null_fraction)
-        for name, (own, tier, truth) in jobs.items():
-            yield Planned(
-                name,
-                {"draw_seed": section.draw_seed, "spawn_key": list(own.spawn_key), "tier": tier,
-                 "truth": truth, "bench": _bench()},
-            )  # fmt: skip
-
-    def load(self, task: Task) -> ChallengeItem:
-        """Return what the case is made from."""
-        s = task.settings
-        own = np.random.SeedSequence(s["draw_seed"], spawn_key=tuple(s["spawn_key"]))
-        return own, s["tier"], s["truth"], s["bench"]
-
-    def work(self, item: ChallengeItem, seed: int) -> Work:
-        """Make the case, diagnose its files, and mark the diagnosis with its key."""
-        with from_the_bench(_TABLE):
-            from challenge.answers import read_answer
-            from challenge.make import make_case
-
-        own, tier, truth, bench = item
-        if _bench() != bench:
-            raise CalibError(
-                "this worker would make other cases", where=_TABLE,
-                expected=f"the folder `challenge` whose hash is {bench}",
-                hint="give the worker the same checkout",
-            )  # fmt: skip
-        made = make_case(own, tier, truth)
-        with TemporaryDirectory() as scratch:
-            folder = Path(scratch) / "case"
-            made.write(folder)
-            found = diagnose(read_case(folder), seed)
-            files = written(found)
-            for name in ("diagnosis.json", "fresh_prediction.csv"):
-                (folder / name).write_bytes(files[name])
-            answer = read_answer("case", made.key, folder)
-        numbers = {
-            "tier": answer.tier,
-            "truth": answer.truth,
-            "truth_probability": answer.truth_probability,
-            "right_first": answer.among_first(1),
-            "right_first_two": answer.among_first(2),
-            "localisation_auc": answer.auc,
-            "gap_over_noise": made.key["gap_over_noise"],
-            "actual_shrink": {s.output: s.actual for s in answer.shrinks},
-            "shrink_covered": {s.output: s.covered for s in answer.shrinks},
-        }
-        return Work(numbers | diagnosis_numbers(found), files)
+    own, tier, truth, bench = item
+    if _bench() != bench:
+        raise CalibError(
+            "this worker would make other cases",
+            where="[[challenge]]",
+            expected=f"the folder `challenge` whose hash is {bench}",
+            hint="give the worker the same checkout",
+        )
+    made = make_case(own, tier, truth)
+    with TemporaryDirectory() as scratch:
+        folder = Path(scratch) / "case"
+        made.write(folder)
+        found = diagnose(read_case(folder), seed)
+        files = written(found)
+        for name in ("diagnosis.json", "fresh_prediction.csv"):
+            (folder / name).write_bytes(files[name])
+        answer = read_answer("case", made.key, folder)
+    numbers = {
+        "tier": answer.tier,
+        "truth": answer.truth,
+        "truth_probability": answer.truth_probability,
+        "right_first": answer.among_first(1),
+        "right_first_two": answer.among_first(2),
+        "localisation_auc": answer.auc,
+        "gap_over_noise": made.key["gap_over_noise"],
+        "actual_shrink": {s.output: s.actual for s in answer.shrinks},
+        "shrink_covered": {s.output: s.covered for s in answer.shrinks},
+    }
+    return numbers | diagnosis_numbers(found), files
 
 
 def _bench() -> str:
@@ -529,6 +508,9 @@ def _bench() -> str:
     return source_sha256(Path(challenge.__path__[0]))[:12]
 
 
-KINDS: dict[str, Kind[Any, Any]] = {
-    kind.name: kind for kind in (Fit(), Diagnose(), Challenge(), Sbc())
+KINDS: Mapping[str, Kind] = {
+    "fit": Kind(FitSection, _plan_fits, _load_fit, _fit),
+    "diagnose": Kind(DiagnoseSection, _plan_diagnoses, _load_diagnosis, _diagnose),
+    "challenge": Kind(ChallengeSection, _plan_challenge, _load_challenge, _challenge),
+    "sbc": Kind(SbcSection, _plan_sbc, _load_sbc, _sbc),
 }

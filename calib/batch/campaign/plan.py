@@ -16,8 +16,6 @@ from calib.data.files import MEND_TOML, decoded
 from calib.errors import CalibError
 from calib.inference.random import stream
 
-SEED = 2019
-
 
 @dataclass(frozen=True)
 class Plan:
@@ -52,19 +50,22 @@ def read_plan(path: Path) -> Plan:
     """
     path = Path(path)
     text, content = _read(path)
-    seed = content.pop("seed", SEED)
+    seed = content.pop("seed", 2019)
     if not isinstance(seed, int) or isinstance(seed, bool) or seed < 0:
         raise CalibError(
-            f"the seed is {seed!r}", where=f"{path}, seed", expected="0 or a positive whole number",
+            f"the seed is {seed!r}",
+            where=f"{path}, seed",
+            expected="0 or a positive whole number",
             hint="correct it, or leave it out",
-        )  # fmt: skip
+        )
     unknown = [key for key in content if key not in KINDS]
     if unknown or not content:
         raise CalibError(
             f"unknown table {', '.join(unknown)}" if unknown else "the plan has no tasks",
-            where=str(path), expected="seed, " + ", ".join(f"[[{kind}]]" for kind in KINDS),
+            where=str(path),
+            expected="seed, " + ", ".join(f"[[{kind}]]" for kind in KINDS),
             hint="correct the name" if unknown else "add a table",
-        )  # fmt: skip
+        )
     tasks: dict[str, Task] = {}
     sections: dict[str, str] = {}
     for name, kind in KINDS.items():
@@ -74,10 +75,20 @@ def read_plan(path: Path) -> Plan:
             if section.name in sections:
                 raise CalibError(
                     f"the name {section.name!r} is that of {sections[section.name]} too",
-                    where=where, hint="give each table a name of its own",
-                )  # fmt: skip
+                    where=where,
+                    hint="give each table a name of its own",
+                )
             sections[section.name] = where
-            _add(tasks, kind, section, Place(path.parent, where), seed)
+            for label, settings, inputs in kind.plan(section, Place(path.parent, where)):
+                task = f"{section.name}.{label}"
+                if task in tasks:
+                    raise CalibError(
+                        f"two tasks would be called {task}",
+                        where=where,
+                        hint="rename a file, or put its task into a table of another name",
+                    )
+                own = stream(seed if section.seed is None else section.seed, "campaign", task)
+                tasks[task] = Task(task, name, int(own.generate_state(1)[0]), settings, inputs)
     return Plan(path, text, tasks)
 
 
@@ -87,9 +98,10 @@ def _read(path: Path) -> tuple[bytes, dict[str, Any]]:
         return text, tomllib.loads(decoded(text))
     except OSError as error:
         raise CalibError(
-            f"the plan cannot be read ({error.strerror})", where=str(path),
+            f"the plan cannot be read ({error.strerror})",
+            where=str(path),
             hint="give the path of a TOML file",
-        ) from None  # fmt: skip
+        ) from None
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise CalibError(f"not valid TOML: {error}", where=str(path), hint=MEND_TOML) from None
 
@@ -97,48 +109,31 @@ def _read(path: Path) -> tuple[bytes, dict[str, Any]]:
 def _tables(found: Any, name: str, path: Path) -> list[Any]:
     if not isinstance(found, list) or not all(isinstance(table, dict) for table in found):
         raise CalibError(
-            f"{name} is not a list of tables", where=str(path), expected=f"[[{name}]]",
+            f"{name} is not a list of tables",
+            where=str(path),
+            expected=f"[[{name}]]",
             hint="write two brackets",
-        )  # fmt: skip
+        )
     return found
 
 
-def _section(kind: Kind[Any, Any], table: dict[str, Any], where: str) -> Section:
+def _section(kind: Kind, table: dict[str, Any], where: str) -> Section:
+    """Check a table, and say what is wrong with it: a misspelt key before a missing one."""
     try:
-        section: Section = kind.section.model_validate(table)
+        return kind.section.model_validate(table)
     except ValidationError as error:
-        raise _explain(error, kind, where) from None
-    return section
-
-
-def _explain(error: ValidationError, kind: Kind[Any, Any], where: str) -> CalibError:
-    """Say what is wrong with a table: a misspelt key before a missing one, which it may be."""
-    fields = kind.section.model_fields
-    first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
-    key = str(first["loc"][0])
+        first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
+    key, fields = str(first["loc"][0]), kind.section.model_fields
     if first["type"] == "extra_forbidden":
-        return CalibError(
+        raise CalibError(
             f"unknown key {key}", where=where, expected=", ".join(fields), hint="correct its name"
         )
-    allowed = f"{key} = {fields[key].description}"
+    expected = f"{key} = {fields[key].description}"
     if first["type"] == "missing":
-        return CalibError(f"{key} is missing", where=where, expected=allowed, hint="add it")
-    found = first["input"]
-    return CalibError(
-        f"{found!r} will not do", where=f"{where}, {key}", expected=allowed, hint="correct it"
+        raise CalibError(f"{key} is missing", where=where, expected=expected, hint="add it")
+    raise CalibError(
+        f"{first['input']!r} will not do",
+        where=f"{where}, {key}",
+        expected=expected,
+        hint="correct it",
     )
-
-
-def _add(
-    tasks: dict[str, Task], kind: Kind[Any, Any], section: Section, place: Place, seed: int
-) -> None:
-    seed = seed if section.seed is None else section.seed
-    for planned in kind.plan(section, place):
-        name = f"{section.name}.{planned.label}"
-        if name in tasks:
-            raise CalibError(
-                f"two tasks would be called {name}", where=place.where,
-                hint="rename a file, or put its task into a table of another name",
-            )  # fmt: skip
-        own = int(stream(seed, "campaign", name).generate_state(1)[0])
-        tasks[name] = Task(name, kind.name, own, planned.settings, planned.inputs)

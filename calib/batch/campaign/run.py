@@ -25,10 +25,10 @@ from calib.batch.tasks import check_names, failed_tasks, run_tasks
 from calib.errors import CalibError
 from calib.report.numbers import finite
 
-NUMBERS = "numbers.json"
-_SUMMARY_SCHEMA = "calib/campaign/1"
+_NUMBERS, _RECORD, _PLAN = "numbers.json", "task.json", "plan.toml"
 
-type State = Literal["done", "failed", "missing"]
+# Kind, seed, record and content of a task: all that a worker needs of it.
+type _Item = tuple[str, int, Mapping[str, Any], Any]
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Summary:
     numbers: Mapping[str, Mapping[str, Any]]
     failed: Mapping[str, str]
 
-    def state(self, name: str) -> State:
+    def state(self, name: str) -> Literal["done", "failed", "missing"]:
         """Whether a task is done, failed, or has not come to its end."""
         return "done" if name in self.numbers else "failed" if name in self.failed else "missing"
 
@@ -69,7 +69,7 @@ def summarise(plan: Plan, results: Path) -> Summary:
     """Read what there is of a campaign."""
     numbers = {}
     for name in plan.tasks:
-        path = results / name / NUMBERS
+        path = results / name / _NUMBERS
         if path.exists():
             numbers[name] = json.loads(path.read_bytes())
     failed = {n: e for n, e in failed_tasks(results).items() if n in plan.tasks}
@@ -79,7 +79,7 @@ def summarise(plan: Plan, results: Path) -> Summary:
 def write_summary(summary: Summary, folder: Path) -> None:
     """Write ``summary.json``, and for every kind of task a CSV of its name with a row for each."""
     document = {
-        "schema": _SUMMARY_SCHEMA,
+        "schema": "calib/campaign/1",
         "counts": summary.counts,
         "tasks": {name: _entry(summary, name) for name in summary.kinds},
     }
@@ -118,17 +118,13 @@ def _flat(numbers: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, A
             yield f"{prefix}{key}", value
 
 
-RECORD = "task.json"
-SCHEMA = "calib/task/1"
-
-
 def describe(tasks: Iterable[Task]) -> dict[str, dict[str, Any]]:
     """Return for every task all that its result depends on, hashes of its inputs among it."""
     with_versions = versions()
     hashes: dict[Path, str | None] = {}
     return {
         task.name: {
-            "schema": SCHEMA, "task": task.name, "kind": task.kind, "seed": task.seed,
+            "schema": "calib/task/1", "task": task.name, "kind": task.kind, "seed": task.seed,
             "settings": dict(task.settings),
             "inputs": {label: _hash(path, hashes) for label, path in task.inputs.items()},
             "versions": with_versions,
@@ -160,7 +156,7 @@ def discard_changed(
     changed = {}
     for name, record in records.items():
         if (results / name).exists():
-            what = _difference(record, results / name / RECORD)
+            what = _difference(record, results / name / _RECORD)
             if what:
                 changed[name] = what
     if changed and not overwrite:
@@ -174,7 +170,7 @@ def discard_changed(
         )
     for name in changed:
         # Without its record, a folder that a kill leaves half removed is not taken for a result.
-        (results / name / RECORD).unlink(missing_ok=True)
+        (results / name / _RECORD).unlink(missing_ok=True)
         shutil.rmtree(results / name)
 
 
@@ -189,15 +185,8 @@ def _difference(record: Mapping[str, Any], path: Path) -> str:
                     return f"{key} ({part})"
         others = [key for key in record if key not in parts and record[key] != there[key]]
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return RECORD
+        return _RECORD
     return ", ".join(others)
-
-
-PLAN = "plan.toml"
-
-
-# Kind, seed, record and content of a task: all that a worker needs of it.
-type _Item = tuple[str, int, Mapping[str, Any], Any]
 
 
 def run_campaign(
@@ -235,7 +224,7 @@ def run_campaign(
     """
     out, results = Path(out), Path(out) / "results"
     check_names(plan.tasks)
-    if (out / PLAN).exists():
+    if (out / _PLAN).exists():
         check_room(out)
     else:
         check_folder(out)
@@ -243,7 +232,7 @@ def run_campaign(
     discard_changed(records, results, overwrite=overwrite)
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
-        (out / PLAN).write_bytes(plan.text)
+        (out / _PLAN).write_bytes(plan.text)
 
     def load(task: Task) -> _Item:
         return task.kind, task.seed, records[task.name], KINDS[task.kind].load(task)
@@ -262,6 +251,6 @@ def run_campaign(
 
 def _work(item: _Item) -> dict[str, str | bytes]:
     kind, seed, record, content = item
-    work = KINDS[kind].work(content, seed)
-    numbers = json.dumps(finite(work.numbers), indent=1, allow_nan=False) + "\n"
-    return {**work.files, NUMBERS: numbers, RECORD: json.dumps(record, indent=1) + "\n"}
+    found, files = KINDS[kind].work(content, seed)
+    numbers = json.dumps(finite(found), indent=1, allow_nan=False) + "\n"
+    return {**files, _NUMBERS: numbers, _RECORD: json.dumps(record, indent=1) + "\n"}
