@@ -1,20 +1,26 @@
-"""The commands `report`, `fit` and `compare`."""
+"""The commands `report`, `fit`, `compare` and `predict`."""
 
 from __future__ import annotations
 
+import csv
+import math
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from calib.cli import options as opt
-from calib.cli.machine import Json, finish
+from calib.cli.options import announce, emulate, finish, progress_bars, say_failed
+from calib.errors import CalibError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
+    from calib.data import Table
+    from calib.inference.calibration import Calibration
+    from calib.inference.emulation import Emulation
     from calib.report.sections import Section
+    from calib.report.verdict import Verdict
 
 
 def report(
@@ -49,26 +55,24 @@ def report(
     workers: opt.Workers = opt.CORES,
     plugins: opt.Models = None,
     simulator: opt.Simulators = None,
-    json: Json = False,
+    json: opt.Json = False,
 ) -> None:
     """Calibrate, predict, validate and write a report folder with an index.html."""
-    from calib.batch.folders import claimed
-    from calib.batch.pool import pool
-
-    ctx.with_resource(claimed(out, overwrite=overwrite))
     from dataclasses import replace
 
     from calib import SamplerSettings, read_table
-    from calib.cli.options import progress_bars, tell_compared, tell_verdict
-    from calib.cli.simulators import say
+    from calib.batch.folders import claimed
+    from calib.batch.pool import pool
     from calib.data.quantities import OUTPUTS
-    from calib.inference.emulation.prepared import prepare
     from calib.inference.prior_files import prior_file_model
     from calib.report.sections import EmulatorSection, work_out
     from calib.report.study_tasks import HoldOut, fitted_rows, plan_tasks
     from calib.report.verdict import judge_evidence
     from calib.report.writer import write_report
 
+    ctx.with_resource(claimed(out, overwrite=overwrite))
+    title = "Calibration report"
+    sections: list[Section[Any]] = []
     if files:
         tasks = plan_tasks(
             [read_table(f, allow_missing=tuple(OUTPUTS.values())) for f in files],
@@ -77,71 +81,60 @@ def report(
             prior_paths=priors or (),
             only=only or (),
         )
-        title = "Calibration report"
-        sections: Sequence[Section[Any]] = ()
     else:
+        # The gaps and tables of the source have no place beside the user's own data.
         from calib.he2019.designs import he2019_tasks
         from calib.he2019.sections import AuditSection, GapsSection
 
         tasks = he2019_tasks()
-        # Beside the user's own data, the source's gaps and tables have no place.
-        sections = (GapsSection(), AuditSection())
+        sections = [GapsSection(), AuditSection()]
         title = "Calibration report: He, Sandu & Osorio (2019), reconstructed data"
     settings = SamplerSettings(max_steps=max_steps)
-    to_prepare = {task.model: (task, task.prior_path) for task in tasks}
+    prepared = {task.model: (task, task.prior_path) for task in tasks}
     if compare:
         from calib.report.comparison import plan_comparison
 
-        comparison = plan_comparison(
-            tasks, compare, {prior_file_model(path): path for path in priors or ()}
-        )
-        comparison = replace(comparison, settings=settings, command=opt.command(), workers=workers)
-        to_prepare |= {name: (comparison.task, comparison.priors.get(name)) for name in compare}
-        sections = (*sections, comparison)
-    with progress_bars() as tell:
-        emulations = {
-            name: prepare(
-                name, fitted_rows(task)[0], seed, priors=path, elsewhere=[task.table],
-                workers=workers, progress=tell,
-            )
-            for name, (task, path) in to_prepare.items()
-        }  # fmt: skip
-    good = [say(model, emulation) for model, emulation in emulations.items()]
-    made = {model: e.document() for model, e in emulations.items() if e is not None}
-    if made:
-        sections = (*sections, EmulatorSection(made))
+        given = {prior_file_model(path): path for path in priors or ()}
+        planned = plan_comparison(tasks, compare, given)
+        sections.append(replace(planned, settings=settings, command=opt.command(), workers=workers))
+        prepared |= {name: (planned.task, planned.priors.get(name)) for name in compare}
+    emulations: dict[str, Emulation] = {}
+    for name, (task, path) in prepared.items():
+        rows = {name: (fitted_rows(task)[0], path)}
+        emulations |= emulate(rows, seed, workers, [task.table])
+    if emulations:
+        sections.append(EmulatorSection({name: e.document() for name, e in emulations.items()}))
     with pool(workers) as side, progress_bars() as tell:
         found = work_out(
             tasks, seed, settings=settings, sections=sections, progress=tell, workers=workers,
             pool=side,
         )  # fmt: skip
-        study = found.study
         page = write_report(
             found, out, settings=settings, command=opt.command(), title=title,
             overwrite=overwrite, posteriors=posteriors and views, views=views, pdf=pdf,
             progress=tell, pool=side,
         )  # fmt: skip
-    verdicts = {}
+    study, verdicts = found.study, {}
     for key, result in study.successes.items():
         ninety = result.validation.scores.coverage[0.9]
         state = "converged" if result.calibration.converged else "NOT CONVERGED"
-        fails = made.get(result.task.model, {}).get("reasons", ())
-        verdicts[key] = judge_evidence(replace(result.evidence, emulator_fails=fails))
+        emulation = emulations.get(result.task.model)
+        fails = () if emulation is None else emulation.reasons
+        judged = judge_evidence(replace(result.evidence, emulator_fails=fails))
+        verdicts[key] = judged.document()
         print(f"{key}: {state}; 90 % band covers {ninety.hits} of {ninety.n} rows not fitted")
-        tell_verdict(verdicts[key], f"{key}: ")
+        tell_verdict(judged, f"{key}: ")
     for key, failure in study.failures.items():
         print(f"{key}: FAILED: {failure.error}", file=sys.stderr)
     print(page)
     converged = all(r.calibration.converged for r in study.successes.values())
-    for section, part in found.parts:
-        if section.name == "comparison":
-            record = section.record(part)
-            tell_compared(record)
-            print(record["verdict"])
-            converged &= bool(record["converged"])
-    code = 1 if study.failures else 0 if converged and all(good) else 3
-    told = {key: found.document() for key, found in verdicts.items()}
-    finish(code, out / "summary.json", folder=str(out), verdicts=told)
+    for record in (s.record(part) for s, part in found.parts if s.name == "comparison"):
+        tell_compared(record)
+        print(record["verdict"])
+        converged &= bool(record["converged"])
+    good = converged and all(e.passed for e in emulations.values())
+    code = 1 if study.failures else 0 if good else 3
+    finish(code, out / "summary.json", folder=str(out), verdicts=verdicts)
 
 
 def fit(
@@ -157,7 +150,7 @@ def fit(
     workers: opt.Workers = opt.CORES,
     plugins: opt.Models = None,
     simulator: opt.Simulators = None,
-    json: Json = False,
+    json: opt.Json = False,
 ) -> None:
     """Calibrate one model on one file and save the posterior."""
     from dataclasses import asdict
@@ -166,9 +159,6 @@ def fit(
     from calib import SamplerSettings, build_problem, calibrate, estimate, save_calibration
     from calib.batch.folders import claimed, fresh_folder
     from calib.batch.foreign import keep
-    from calib.cli.options import posterior_table, progress_bars, tell_verdict, verdict_line
-    from calib.cli.simulators import say, say_failed
-    from calib.inference.emulation.prepared import prepare
     from calib.inference.random import generator
     from calib.models import get_model
     from calib.report.numbers import format_number
@@ -182,34 +172,27 @@ def fit(
     settings = SamplerSettings(max_steps=max_steps)
     kept = None if hold_out is None else HoldOut.parse(hold_out)
     fitted, held = read_and_split(file, (*chosen.conditions, chosen.output), kept)
+    emulations = emulate({model: (fitted, priors)}, seed, workers, [held])
     with progress_bars() as tell:
-        emulation = prepare(
-            model, fitted, seed, priors=priors, elsewhere=[] if held is None else [held],
-            workers=workers, progress=tell,
-        )  # fmt: skip
         problem = build_problem(model, fitted, priors)
         point = estimate(problem, "least_squares", generator(seed, model, "least_squares"))
         calibration = calibrate(
-            problem, seed, estimates=(point,), settings=settings,
-            progress=lambda done, planned: tell("sampling", done, planned),
-        )  # fmt: skip
+            problem, seed, estimates=(point,), settings=settings, progress=partial(tell, "sampling")
+        )
         keep("run", partial(save_calibration, calibration))
         preference = noise_preference(
             calibration, settings=settings, workers=workers,
-            progress=lambda done, planned: tell("leaving rows out", done, planned),
+            progress=partial(tell, "leaving rows out"),
         )  # fmt: skip
     with fresh_folder(out, overwrite=overwrite) as folder:
         save_calibration(calibration, folder)
-    fails = () if emulation is None else emulation.reasons
     validation = validated(calibration, held)
+    fails = tuple(reason for e in emulations.values() for reason in e.reasons)
     judged = verdict(calibration, validation, emulator_fails=fails, held_out=str(kept or ""))
     keep_verdict(judged, out)
     posterior_table(calibration, judged)
     print(verdict_line(calibration))
-    good = say(model, emulation)
     say_failed(model)
-    if preference is not None:
-        print(preference.sentence)
     for note in problem.notes:
         print(f"note: {note}", file=sys.stderr)
     found: dict[str, Any] = {
@@ -217,11 +200,11 @@ def fit(
         "posterior": {name: asdict(s) for name, s in calibration.summary.items()},
     }  # fmt: skip
     if preference is not None:
+        print(preference.sentence)
         found["preference"] = asdict(preference)
     if validation is not None:
-        scores = validation.scores
+        scores, k = validation.scores, validation.pareto_k
         ninety = scores.coverage[0.9]
-        k = validation.pareto_k
         rough = 0 if k is None else int((k > PARETO_K_MAX).sum())
         print(
             f"{'left out one by one' if held is None else f'held out ({kept})'}: 90 % band covers "
@@ -235,7 +218,8 @@ def fit(
         }  # fmt: skip
     tell_verdict(judged)
     print(f"run folder: {out}")
-    finish(0 if calibration.converged and good else 3, out / "run.json", **found)
+    good = calibration.converged and all(e.passed for e in emulations.values())
+    finish(0 if good else 3, out / "run.json", **found)
 
 
 def compare(
@@ -250,56 +234,284 @@ def compare(
     workers: opt.Workers = opt.CORES,
     plugins: opt.Models = None,
     simulator: opt.Simulators = None,
-    json: Json = False,
+    json: opt.Json = False,
 ) -> None:
     """Say which of several models the same data prefer, and what they cannot tell."""
     from functools import partial
 
     from calib.batch.folders import claimed, fresh_folder
     from calib.batch.foreign import drop, keep
-    from calib.cli.options import progress_bars, tell_compared
-    from calib.cli.simulators import say
-    from calib.inference.emulation.prepared import prepare
     from calib.inference.prior_files import prior_file_model
     from calib.inference.sampling.sampler import SamplerSettings
     from calib.models import get_model
     from calib.report.comparison import text, write_comparison
     from calib.report.study_tasks import HoldOut, read_and_split
     from calib.validation.comparison import check_comparable
-    from calib.validation.comparison import compare as find
+    from calib.validation.comparison import compare as compare_models
 
     *models, file = what
     ctx.with_resource(claimed(out, overwrite=overwrite))
     check_comparable(models)
-    chosen = [get_model(name) for name in models]
-    needed = {c for m in chosen for c in (*m.conditions, m.output)}
+    needed = {c for m in map(get_model, models) for c in (*m.conditions, m.output)}
     kept = None if hold_out is None else HoldOut.parse(hold_out)
     fitted, held = read_and_split(Path(file), sorted(needed), kept)
-    elsewhere = [] if held is None else [held]
     given = {prior_file_model(path): path for path in priors or ()}
+    rows = {name: (fitted, given.get(name)) for name in models}
+    emulations = emulate(rows, seed, workers, [held])
     with progress_bars() as tell:
-        emulations = {
-            name: prepare(
-                name, fitted, seed, priors=given.get(name), elsewhere=elsewhere, workers=workers,
-                progress=tell,
-            )
-            for name in models
-        }  # fmt: skip
-        found = find(
+        found = compare_models(
             fitted, models, seed, held_out=held, priors=given,
             settings=SamplerSettings(max_steps=max_steps), progress=tell, workers=workers,
         )  # fmt: skip
-    fails = {name: e.reasons for name, e in emulations.items() if e is not None}
     write = partial(
         write_comparison, found, command=opt.command(), hold_out=hold_out or "",
-        emulator_fails=fails,
+        emulator_fails={name: e.reasons for name, e in emulations.items()},
     )  # fmt: skip
     drop()
     keep("comparison", write)
-    good = [say(name, emulation) for name, emulation in emulations.items()]
     with fresh_folder(out, overwrite=overwrite) as folder:
         written = write(folder)
     tell_compared(written)
     print(text(written))
     print(out / "index.html")
-    finish(0 if found.sound and all(good) else 3, written, folder=str(out))
+    good = found.sound and all(e.passed for e in emulations.values())
+    finish(0 if good else 3, written, folder=str(out))
+
+
+def posterior_table(calibration: Calibration, judged: Verdict) -> None:
+    """Print a calibration's posterior as a table, in agreement with its verdict."""
+    from rich.table import Table as RichTable
+
+    from calib.report.numbers import centre_text, interval_text
+    from calib.validation.assumptions import parameter_remarks
+
+    problem = calibration.problem
+    table = RichTable(title=f"{problem.bound.model.name}: posterior of {len(problem.table)} rows")
+    for heading in ("parameter", "unit"):
+        table.add_column(heading)
+    for heading in ("mean ± sd or median", "95 % HDI", "ESS bulk/tail", "R-hat"):
+        table.add_column(heading, justify="right")
+    table.add_column("remark")
+    remarks = parameter_remarks(calibration, judged.remarks)
+    for s in calibration.summary.values():
+        ess = f"{s.ess_bulk:.0f}/{s.ess_tail:.0f}"
+        numbers = (centre_text(s), interval_text(s), ess, f"{s.rhat:.3f}")
+        table.add_row(s.name, s.unit, *numbers, remarks[s.name])
+    opt.wide_console(120).print(table)
+
+
+def tell_verdict(found: Verdict, of: str = "") -> None:
+    """Print a verdict, the warnings behind it first."""
+    for warning in found.warnings:
+        print(f"warning: {of}{warning}", file=sys.stderr)
+    for line in found.lines:
+        print(f"{of}{line}")
+
+
+def tell_compared(found: Mapping[str, Any]) -> None:
+    """Print the verdict on each model of a comparison, as `comparison.json` has it."""
+    from calib.report.verdict import Verdict
+
+    for name, model in found["models"].items():
+        tell_verdict(Verdict.of(model["verdict"]), f"{name}: ")
+
+
+def verdict_line(calibration: Calibration) -> str:
+    """Say whether a calibration passed the gate, and what to do if not."""
+    gate = calibration.draws.report
+    if gate.passed:
+        return (
+            f"converged: {calibration.draws.t.shape[0]} ensembles, {gate.steps} steps, "
+            f"R-hat at most {gate.rhat.max():.4f}, ESS at least "
+            f"{min(gate.ess_bulk.min(), gate.ess_tail.min()):.0f}"
+        )
+    return (
+        "NOT CONVERGED, do not use these numbers: "
+        + "; ".join(gate.reasons[:3])
+        + ". Raise --max-steps, or give tighter priors for parameters the data do not determine."
+    )
+
+
+def predict(
+    run: Annotated[
+        Path, typer.Argument(help="Folder of `calib fit`, `calib compare` or `calib diagnose`.")
+    ],
+    at: Annotated[Path, typer.Option(help="CSV with the conditions.")],
+    out: Annotated[Path | None, typer.Option(help="CSV to write; printed if none.")] = None,
+    effects: opt.EffectsFile = None,
+    without: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Cause of a diagnosis that no longer acts, as of an "
+            "instrument that was mended; repeatable."
+        ),
+    ] = None,
+    overwrite: opt.Overwrite = False,
+    plugins: opt.Models = None,
+    simulator: opt.Simulators = None,
+    json: opt.Json = False,
+) -> None:
+    """Predict at new conditions: with 50, 90 and 95 % bands; a diagnosis with 90 % bands."""
+    from calib.batch.folders import check_room
+
+    if out is not None:
+        if out.exists():
+            _check_replaceable(out, at, overwrite)
+        check_room(out)
+    if (run / "corrected.json").exists():
+        _predict_corrected(run, at, out, effects, without or [])
+        return
+    if effects is not None or without:
+        raise CalibError(
+            "there is no diagnosis, which alone has effects",
+            where=str(run),
+            expected="a folder of `calib diagnose`",
+            hint="correct its name, or leave --effects and --without out",
+        )
+    from calib import load_calibration
+    from calib.data import read_for_model
+    from calib.data.checks import beyond_notes, check_conditions
+    from calib.models.simulators.emulator import emulator_of
+    from calib.report.comparison import load_stack, verdicts_of
+    from calib.validation.prediction import MIN_DEFINED, predict_stacked, prediction_columns
+    from calib.validation.prediction import predict as predict_at
+
+    if (run / "comparison.json").exists():
+        found, stack = load_stack(run)
+        converged = bool(found["converged"])
+    else:
+        stack = [(1.0, load_calibration(run))]
+        converged = stack[0][1].converged
+    if not converged:
+        announce("this calibration did not converge; its bands are not to be used")
+    problems = {c.problem.bound.model.name: c.problem for _, c in stack}
+    table = read_for_model(
+        at, tuple(dict.fromkeys(n for p in problems.values() for n in p.bound.model.conditions))
+    )
+    known = {n: v for p in problems.values() for n, v in p.conditions.items()}
+    check_conditions(table, known)
+    kept, doubts = verdicts_of(run), dict[str, None]()
+    for name in problems:
+        judged = kept.get(name) or kept.get("")
+        for doubt in () if judged is None else judged.for_rows(table.columns):
+            doubts[f"{name}: {doubt}" if len(stack) > 1 else doubt] = None
+    for doubt in doubts:
+        announce(doubt)
+    prediction = (
+        predict_at(stack[0][1], table) if len(stack) == 1 else predict_stacked(stack, table)
+    )
+    columns = prediction_columns(prediction, table)
+    if not converged:
+        columns["converged"] = ["no"] * len(table)
+    outside = sum(bool(flags) for flags in prediction.outside)
+    if outside:
+        lie = "row lies" if outside == 1 else "rows lie"
+        beyond = f"{outside} {lie} outside the calibrated range, where the prediction is not"
+        for note in (f"{beyond} to be trusted", *beyond_notes(table, known)):
+            print(f"warning: {note}", file=sys.stderr)
+    undefined = int((prediction.defined < MIN_DEFINED).sum())
+    if undefined:
+        why = ": the model has none there for much of the posterior"
+        if any(emulator_of(p.bound.model) is not None for p in problems.values()):
+            why = (
+                "; an emulator ends where its runs do: give [ranges] in the simulator file, and "
+                "fit again"
+            )
+        announce(f"no value (nan) at {undefined} of {len(table)} rows{why}")
+    _give(columns, out, *(p.table for p in problems.values()))
+    numbers = {"columns": _numbers(columns)}
+    finish(0 if converged else 3, numbers, outside=outside, doubts=list(doubts))
+
+
+def _check_replaceable(out: Path, at: Path, overwrite: bool) -> None:
+    """Refuse to replace a file unless it is a prediction, and that is wanted."""
+    # By its last column a file is known for a prediction: of a run, of one that did not converge,
+    # of a diagnosis.
+    last = ("outside_calibrated_range", "converged", "_after_upper")
+    if not overwrite:
+        wrong, hint = "the file exists already", "choose another --out, or pass --overwrite"
+        raise CalibError(wrong, where=str(out), hint=hint)
+    hint = "choose another --out"
+    if at.exists() and out.samefile(at):
+        wrong = "it holds the conditions, which --out would replace"
+        raise CalibError(wrong, where=str(out), hint=hint)
+    if not out.is_file():
+        return
+    with out.open(encoding="utf-8", errors="replace") as file:
+        header = file.readline().strip()
+    if header and not header.endswith(last):
+        wrong, expected = "the file is no prediction, so it is not replaced", "a CSV that calib"
+        raise CalibError(wrong, where=str(out), expected=f"{expected} predict wrote", hint=hint)
+
+
+def _predict_corrected(
+    run: Path, at: Path, out: Path | None, effects: Path | None, without: Sequence[str]
+) -> None:
+    """Predict with the corrected model of a diagnosis, beside the calibrated simulator."""
+    from calib.batch.plugins import load_files
+    from calib.data import read_for_model
+    from calib.gap.corrected import conditions_outside, load_corrected, predict_columns
+    from calib.gap.effects import EFFECTS
+    from calib.gap.effects.user import load_effects
+
+    load_files(sorted((run / "emulators").glob("*.npz")))
+    own = {} if effects is None else load_effects(effects)
+    corrected = load_corrected(run, {**EFFECTS, **own})
+    used = {c for o in corrected.data.outputs for c in o.problem.bound.model.conditions}
+    table = read_for_model(at, sorted(used))
+    columns = predict_columns(corrected, table, without)
+    if "run_order" in corrected.data.view.conditions and "run_order" not in table:
+        announce(
+            "no run_order is given: what depends on it is predicted as it stood at the end of the "
+            "campaign"
+        )
+    if faults := [cause for cause in corrected.faults if cause not in without]:
+        announce(
+            f"what is predicted is the reading, with {', '.join(faults)} in it; once the "
+            f"instrument is mended, predict --without {' --without '.join(faults)}"
+        )
+    beyond = conditions_outside(corrected, table)
+    if beyond:
+        counts = ", ".join(f"{name} in {count} rows" for name, count in beyond.items())
+        announce(f"outside what the campaigns covered: {counts}")
+    _give(columns, out, corrected.data.case.lab, corrected.data.case.field)
+    finish(0, {"columns": _numbers(columns)}, outside=beyond)
+
+
+def _give(columns: dict[str, Any], out: Path | None, *tables: Table) -> None:
+    """Write columns to a file, or print them; a column says what data of `tables` are called."""
+    from calib.data import write_table
+    from calib.data.reader import common_label
+
+    if label := common_label(*tables):
+        # The last column stays last: by it a prediction is known.
+        name, last = columns.popitem()
+        columns |= {"data_label": [label] * len(last), name: last}
+    if out is not None:
+        write_table(out, {name: [_cell(c, "") for c in column] for name, column in columns.items()})
+        print(f"{len(next(iter(columns.values())))} rows written to {out}")
+        return
+    writer = csv.writer(sys.stdout, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(map(_cell, row) for row in zip(*columns.values(), strict=True))
+
+
+def _cell(cell: Any, empty: str = "nan") -> str:
+    """Write a number with as many digits as draws of a posterior bear, and text as it is."""
+    if isinstance(cell, str):
+        return cell
+    if math.isnan(cell):
+        return empty
+    return f"{cell:.0f}" if float(cell).is_integer() else f"{cell:.6g}"
+
+
+def _numbers(columns: Mapping[str, Any]) -> dict[str, list[float | str]]:
+    """Return columns whose cells, which may be the user's own text, are numbers where they can."""
+
+    def number(cell: Any) -> float | str:
+        try:
+            return float(cell)
+        except ValueError:
+            return str(cell)
+
+    return {name: [number(cell) for cell in column] for name, column in columns.items()}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,7 +10,12 @@ import typer
 
 from calib.batch.environment import from_the_bench
 from calib.cli import options as opt
-from calib.cli.machine import Json, finish
+from calib.cli.options import announce, finish, progress_bars
+
+
+def _tell_failed(failed: Mapping[str, str]) -> None:
+    for name, error in failed.items():
+        announce(f"{name} failed: {error}")
 
 
 def campaign(
@@ -28,11 +33,10 @@ def campaign(
     ] = False,
     plugins: opt.Models = None,
     simulator: opt.Simulators = None,
-    json: Json = False,
+    json: opt.Json = False,
 ) -> None:
     """Run many fits, diagnoses, challenge cases or SBC replicates as tasks; run again to resume."""
     from calib.batch.campaign import read_plan, run_campaign
-    from calib.cli.options import progress_bars
     from calib.data.reader import SEEN
 
     planned = read_plan(plan)
@@ -43,13 +47,12 @@ def campaign(
     with progress_bars() as tell:
         summary = run_campaign(
             planned, out, workers=workers, scheduler=scheduler, overwrite=overwrite,
-            progress=lambda done, n: tell("tasks", done, n), announce=opt.announce,
+            progress=lambda done, n: tell("tasks", done, n), announce=announce,
         )  # fmt: skip
     # Tasks of another process, or of before, have read them.
     labels = (numbers.get("data_label", "") for numbers in summary.numbers.values())
     SEEN.update(dict.fromkeys(filter(None, labels)))
-    for name, error in summary.failed.items():
-        print(f"calib: {name} failed: {error}", file=sys.stderr)
+    _tell_failed(summary.failed)
     counts = summary.counts
     print(f"{counts['done']} of {len(summary.kinds)} tasks done, {counts['failed']} failed")
     if summary.unconverged:
@@ -74,33 +77,31 @@ def sbc(
     scheduler: opt.Scheduler = None,
     plugins: opt.Models = None,
     simulator: opt.Simulators = None,
-    json: Json = False,
+    json: opt.Json = False,
 ) -> None:
     """Prove posteriors and bands calibrated on simulated data whose truth is known."""
     from dataclasses import asdict
 
-    from calib.cli.options import progress_bars
     from calib.models import MODELS
     from calib.report.sbc import text_table, write_sbc
     from calib.validation.sbc import SETTINGS, chosen_models, run_sbc
 
     slow = [name for name in MODELS if name not in chosen_models()]
     if slow and not model:
-        opt.announce(
+        announce(
             f"left out: {', '.join(slow)}, of which each campaign takes minutes; name them with "
             "--model"
         )
     with progress_bars() as tell:
         score = run_sbc(
             out, models=model or (), simulations=simulations, seed=seed, priors=priors or (),
-            data=data, workers=workers, scheduler=scheduler, announce=opt.announce,
+            data=data, workers=workers, scheduler=scheduler, announce=announce,
             progress=lambda done, n: tell("simulating and calibrating", done, n),
         )  # fmt: skip
     page = write_sbc(score, out, asdict(SETTINGS), opt.command())
     print(text_table(score))
     for of_model in score.models:
-        for name, error in of_model.failed.items():
-            print(f"calib: {name} failed: {error}", file=sys.stderr)
+        _tell_failed(of_model.failed)
     print(page)
     bad = score.alarms or any(m.failed for m in score.models)
     finish(1 if bad else 0, out / "sbc.json", folder=str(out))
@@ -109,10 +110,12 @@ def sbc(
 _Cases = Annotated[Path, typer.Argument(help="Folder with cases.")]
 _Key = Annotated[Path, typer.Option(help="Their sealed answers.")]
 
-verbs = typer.Typer(no_args_is_help=True, help="The blind test of the diagnosis.")
+challenge = typer.Typer(no_args_is_help=True, help="The blind test of the diagnosis.")
 
 
-@verbs.command()
+@challenge.command(
+    epilog="Example: calib challenge make --out cases --key key.json --seed 1 --cases 20"
+)
 def make(
     out: Annotated[Path, typer.Option(help="Folder for the cases.")],
     key: Annotated[Path, typer.Option(help="File for the sealed answers, outside it.")],
@@ -124,13 +127,11 @@ def make(
     ] = "both",
     workers: opt.Workers = 2,
     scheduler: opt.Scheduler = None,
-    json: Json = False,
+    json: opt.Json = False,
 ) -> None:
     """Write cases of known cause, and their answers into a sealed key."""
     with from_the_bench("calib challenge make"):
         from challenge.make import make as make_cases
-    from calib.cli.options import progress_bars
-
     with progress_bars() as tell:
         digest = make_cases(
             out, key, seed=seed, n_cases=cases, workers=workers, scheduler=scheduler,
@@ -141,7 +142,7 @@ def make(
     finish(0, {"folder": str(out), "cases": cases, "key_sha256": digest})
 
 
-@verbs.command()
+@challenge.command(epilog="Example: calib challenge run cases --out diagnoses")
 def run(
     folder: _Cases,
     out: Annotated[Path, typer.Option(help="Folder for the diagnoses; resumed if it is there.")],
@@ -149,25 +150,27 @@ def run(
     workers: opt.Workers = 2,
     scheduler: opt.Scheduler = None,
     plugins: opt.Models = None,
-    json: Json = False,
+    json: opt.Json = False,
 ) -> None:
     """Diagnose every case of a folder; run again to resume."""
-    from calib.cli.options import progress_bars
     from calib.gap.batch import case_folders, diagnose_cases
 
     cases = case_folders(folder)
     with progress_bars() as tell:
         failed = diagnose_cases(
-            cases, out, seed, workers=workers, scheduler=scheduler, announce=opt.announce,
+            cases, out, seed, workers=workers, scheduler=scheduler, announce=announce,
             progress=lambda done, n: tell("diagnosing", done, n),
         )  # fmt: skip
-    for name, error in failed.items():
-        print(f"calib: {name} failed: {error}", file=sys.stderr)
+    _tell_failed(failed)
     print(f"{len(cases) - len(failed)} of {len(cases)} cases diagnosed in {out}")
     finish(1 if failed else 0, {"folder": str(out), "cases": len(cases), "failed": failed})
 
 
-@verbs.command("well-specified")
+@challenge.command(
+    "well-specified",
+    epilog="Example: calib challenge well-specified cases --key key.json --out plain --out-key "
+    "plain.json",
+)
 def well_specified(
     folder: _Cases,
     key: _Key,
@@ -176,29 +179,28 @@ def well_specified(
     seed: opt.Seed = 1,
     workers: opt.Workers = 2,
     scheduler: opt.Scheduler = None,
-    json: Json = False,
+    json: opt.Json = False,
 ) -> None:
     """Write the same designs again, with effects that act exactly as the diagnosis believes."""
     with from_the_bench("calib challenge well-specified"):
         from challenge.redraw import redraw
     from functools import partial
 
-    from calib.cli.options import progress_bars
     from calib.gap.well_specified import well_specified_case
 
     with progress_bars() as tell:
         without = redraw(
             folder, key, out, out_key, partial(well_specified_case, seed), seed=seed,
-            workers=workers, scheduler=scheduler, announce=opt.announce,
+            workers=workers, scheduler=scheduler, announce=announce,
             progress=lambda done, n: tell("drawing cases", done, n),
         )  # fmt: skip
     for name, why in without.items():
-        print(f"calib: {name} has no well-specified case: {why}", file=sys.stderr)
+        announce(f"{name} has no well-specified case: {why}")
     print(f"well-specified cases in {out}; diagnose and score them as any others")
     finish(0, {"folder": str(out), "without": without})
 
 
-@verbs.command()
+@challenge.command(epilog="Example: calib challenge score cases --results diagnoses --key key.json")
 def score(
     ctx: typer.Context,
     folder: _Cases,
@@ -209,7 +211,7 @@ def score(
     ] = "",
     out: Annotated[Path | None, typer.Option(help="Folder for the table and figures.")] = None,
     overwrite: opt.Overwrite = False,
-    json: Json = False,
+    json: opt.Json = False,
 ) -> None:
     """Compare diagnoses with the sealed answers."""
     from dataclasses import asdict
@@ -225,7 +227,7 @@ def score(
     found = score_all(folder, results, key, [o.strip() for o in outputs.split(",") if o.strip()])
     table = text_table(found)
     for warning in found.warnings:
-        print(f"calib: {warning}", file=sys.stderr)
+        announce(warning)
     print(table)
     if out is not None:
         with fresh_folder(out, overwrite=overwrite) as scratch:

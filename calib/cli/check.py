@@ -1,4 +1,4 @@
-"""The commands `check` and `audit`, and the table that shows what a check found."""
+"""The commands `check`, `audit` and `doctor`."""
 
 from __future__ import annotations
 
@@ -9,30 +9,68 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from calib.cli import options as opt
-from calib.cli.machine import Json, finish
+from calib.cli.options import announce, finish, progress_bars, wide_console
 from calib.errors import CalibError
 
 if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
     from calib.check.outcome import Item, Outcome
     from calib.he2019.audit import Audit
 
-_MOST = 40
+_Quick = Annotated[
+    bool, typer.Option("--quick", help="Skip the sampling: hashes, inputs and estimates only.")
+]
+
+
+def check(
+    folder: Annotated[Path, typer.Argument(help="Folder of `calib report`, `fit` or `compare`.")],
+    quick: _Quick = False,
+    every: Annotated[
+        bool, typer.Option("--all", help="List every number, not only what is not the same.")
+    ] = False,
+    workers: opt.Workers = opt.CORES,
+    plugins: opt.Models = None,
+    simulator: opt.Simulators = None,
+    json: opt.Json = False,
+) -> None:
+    """Compute a folder's results again from that folder alone and compare everything.
+
+    Ends with 0 where all is the same, 1 where something differs, 2 where it cannot be checked.
+    """
+    try:
+        outcome = _checked(folder, quick, workers)
+    except CalibError as error:
+        reason = {"verdict": "cannot be checked", "reason": str(error), "exit_code": 2}
+        finish(0, {"folder": str(folder), **reason})
+        raise
+    show(outcome, every=every)
+    finish(outcome.exit_code, outcome.document())
+
+
+def _checked(folder: Path, quick: bool, workers: int) -> Outcome:
+    from calib.batch.plugins import load_files
+    from calib.batch.pool import pool
+    from calib.check.check import check as check_folder
+
+    # A slow simulator is checked as it was emulated: nothing is run.
+    load_files(sorted((folder / "emulators").glob("*.npz")))
+    with pool(1 if quick else workers) as side, progress_bars() as tell:
+        return check_folder(folder, quick=quick, progress=tell, pool=side, workers=workers)
 
 
 def show(outcome: Outcome, *, every: bool) -> None:
     """Print what a check found: every number and file, or only those that are not the same."""
     from calib.check.outcome import Status
 
-    # A pipe has no width of its own: wide enough for whole rows.
-    console = Console(width=None if sys.stdout.isatty() else 160, highlight=False, markup=False)
+    console = wide_console()
     console.print(outcome.verdict, soft_wrap=True)
     console.print(_groups(outcome))
     for title, status in (("Different", Status.DIFFERENT), ("Not judged", Status.UNJUDGED)):
-        _print_items(console, title, outcome.of(status), _MOST)
+        _print_items(console, title, outcome.of(status), 40)
     if every:
         _print_items(console, "The same", outcome.of(Status.WITHIN, Status.IDENTICAL), sys.maxsize)
     if outcome.draws_differ:
@@ -51,38 +89,39 @@ def show(outcome: Outcome, *, every: bool) -> None:
 
 def _groups(outcome: Outcome) -> Table:
     """One row for each group: how many of its entries are what."""
+    from rich.table import Table
+
     from calib.check.outcome import Status
     from calib.data.files import plain_number
 
     table = Table()
     table.add_column("compared")
-    for status in Status:
-        table.add_column(str(status), justify="right")
-    table.add_column("largest difference\nof what is allowed", justify="right")
+    for heading in (*Status, "largest difference\nof what is allowed"):
+        table.add_column(str(heading), justify="right")
     groups: dict[str, list[Item]] = {}
     for item in outcome.items:
         groups.setdefault(item.group.partition(" (")[0], []).append(item)
     for name, items in groups.items():
         counts = [sum(item.status is status for item in items) for status in Status]
-        shares = [item.share for item in items if item.share is not None]
-        largest = f"{plain_number(100.0 * max(shares))} %" if any(shares) else ""
-        table.add_row(name, *(str(n) if n else "" for n in counts), largest)
+        largest = max((item.share or 0.0 for item in items), default=0.0)
+        part = f"{plain_number(100.0 * largest)} %" if largest else ""
+        table.add_row(name, *(str(n) if n else "" for n in counts), part)
     return table
 
 
 def _print_items(console: Console, title: str, items: Iterable[Item], most: int) -> None:
+    from rich.table import Table
 
     listed = list(items)
     if not listed:
         return
     table = Table(title=title, title_justify="left")
     for heading in ("what", "recorded", "computed again", "allowed", "remark"):
-        right = heading in ("recorded", "computed again", "allowed")
-        table.add_column(heading, justify="right" if right else "left", overflow="fold")
+        left = heading in ("what", "remark")
+        table.add_column(heading, justify="left" if left else "right", overflow="fold")
     for item in listed[:most]:
-        table.add_row(
-            item.name, _short(item.recorded), _short(item.found), _short(item.allowed), item.note
-        )
+        values = map(_short, (item.recorded, item.found, item.allowed))
+        table.add_row(item.name, *values, item.note)
     console.print(table)
     if len(listed) > most:
         console.print(f"... and {len(listed) - most} more; --all or --json lists them")
@@ -91,45 +130,8 @@ def _print_items(console: Console, title: str, items: Iterable[Item], most: int)
 def _short(value: Any) -> str:
     if value is None:
         return ""
-    if isinstance(value, float):
-        return f"{value:.10g}"
-    text = str(value)
+    text = f"{value:.10g}" if isinstance(value, float) else str(value)
     return text if len(text) <= 24 else f"{text[:16]}..."
-
-
-def check(
-    folder: Annotated[Path, typer.Argument(help="Folder of `calib report`, `fit` or `compare`.")],
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Skip the sampling: hashes, inputs and estimates only.")
-    ] = False,
-    every: Annotated[
-        bool, typer.Option("--all", help="List every number, not only what is not the same.")
-    ] = False,
-    workers: opt.Workers = opt.CORES,
-    plugins: opt.Models = None,
-    simulator: opt.Simulators = None,
-    json: Json = False,
-) -> None:
-    """Compute a folder's results again from that folder alone and compare everything.
-
-    Ends with 0 where all is the same, 1 where something differs, 2 where it cannot be checked.
-    """
-    from calib.batch.plugins import load_files
-    from calib.batch.pool import pool
-    from calib.check.check import check as find
-    from calib.cli.options import progress_bars
-
-    # A slow simulator is checked as it was emulated: nothing is run.
-    load_files(sorted((folder / "emulators").glob("*.npz")))
-    try:
-        with pool(1 if quick else workers) as side, progress_bars() as tell:
-            outcome = find(folder, quick=quick, progress=tell, pool=side, workers=workers)
-    except CalibError as error:
-        finish(0, {"folder": str(folder), "verdict": "cannot be checked", "reason": str(error),
-                   "exit_code": 2})  # fmt: skip
-        raise
-    show(outcome, every=every)
-    finish(outcome.exit_code, outcome.document())
 
 
 def audit(
@@ -137,52 +139,113 @@ def audit(
     out: Annotated[
         Path | None, typer.Option(help="Folder for audit.json, audit.csv, figures and a page.")
     ] = None,
-    json: Json = False,
+    json: opt.Json = False,
     seed: opt.Seed = 2019,
     overwrite: opt.Overwrite = False,
 ) -> None:
     """Audit the published tables of He, Sandu & Osorio (2019): every figure and its verdict."""
     from calib.batch.folders import claimed, fresh_folder
-    from calib.cli.options import progress_bars
     from calib.he2019.audit import audit_json, run_audit
+    from calib.he2019.sections import write_audit_page
 
     if out is not None:
         ctx.with_resource(claimed(out, overwrite=overwrite))
     with progress_bars() as tell:
         found = run_audit(seed, progress=tell)
         if out is not None:
-            from calib.he2019.sections import write_audit_page
-
             tell("drawing figures", 0, 1)
             with fresh_folder(out, overwrite=overwrite) as folder:
                 write_audit_page(found, folder, opt.command())
             tell("drawing figures", 1, 1)
-    _print(found)
+    _print_audit(found)
     if out is not None:
         print(out / "index.html")
     finish(0, loads(audit_json(found)))
 
 
-def _print(found: Audit) -> None:
-    from rich.console import Console
-    from rich.table import Table as RichTable
-    from rich.text import Text
+def _print_audit(found: Audit) -> None:
+    from rich.table import Table
 
     from calib.he2019.sections import AUDIT_MARKS
 
-    table = RichTable(title="Audit of He, Sandu & Osorio (2019)", show_lines=True)
+    table = Table(title="Audit of He, Sandu & Osorio (2019)", show_lines=True)
     for heading in ("verdict", "where", "claim or reading", "evidence"):
         table.add_column(heading)
     for f in found.findings:
         where = f"{f.where}\n[reconstructed data]" if f.reconstructed else f.where
-        cells = (f"{AUDIT_MARKS[f.verdict]} {f.verdict.value}", where, f.claim, f.evidence)
-        table.add_row(*map(Text, cells))
-    # A pipe has no width of its own: wide enough for whole rows.
-    console = Console(width=None if sys.stdout.isatty() else 160)
-    console.print(table)
+        table.add_row(f"{AUDIT_MARKS[f.verdict]} {f.verdict.value}", where, f.claim, f.evidence)
+    wide_console().print(table)
     counts = ", ".join(f"{n} {verdict.value}" for verdict, n in found.counts.items())
     print(f"{len(found.findings)} findings: {counts}")
     print(
         "Verdicts marked [reconstructed data] show what a method does with such data and prove "
         "nothing about the measured ones."
     )
+
+
+def doctor(
+    report: Annotated[
+        Path | None,
+        typer.Option(help="Report to check; reports/he2019 of a checkout by default."),
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Check it without the sampling, in seconds.")
+    ] = False,
+    json: opt.Json = False,
+) -> None:
+    """Say what is installed, on which processor, and whether the shipped report checks here.
+
+    The report is computed again as `calib check` does, some 20 s on two cores; --quick leaves the
+    sampling out.
+
+    Ends with 0 where all is well, 1 where the report differs, 2 where it cannot be checked.
+    """
+    from importlib.metadata import PackageNotFoundError, version
+
+    import calib
+    from calib.batch.environment import Environment
+    from calib.data.quantities import QUANTITIES
+    from calib.gap.effects import EFFECTS
+    from calib.models import MODELS
+
+    def installed(package: str) -> str | None:
+        try:
+            return version(package)
+        except PackageNotFoundError:
+            return None
+
+    # A checkout has a report, a wheel has none.
+    shipped = Path(calib.__path__[0]).parent / "reports" / "he2019"
+    folder = report or (shipped if (shipped / "manifest.json").is_file() else None)
+    if folder is not None and not quick:
+        announce(f"computes {folder} again below, some 20 s; --quick leaves the sampling out")
+    environment = Environment.here().document()
+    # By the extra of `pip install terracalib[...]` the package that shows it is there, and its use.
+    extras = {
+        "dashboard": ("bokeh", "Dask's page of what the workers do"),
+        "docs": ("sphinx", "the documentation of a checkout"),
+        "test": ("pytest", "the tests of a checkout"),
+    }
+    optional = {extra: installed(package) for extra, (package, _) in extras.items()}
+    registered = {
+        "models": sorted(MODELS), "effects": sorted(EFFECTS), "quantities": sorted(QUANTITIES),
+    }  # fmt: skip
+    lines = ["versions", *(f"  {name} {v}" for name, v in environment["versions"].items())]
+    lines += ["machine", *(f"  {name}: {v}" for name, v in environment["machine"].items())]
+    lines.append("optional")
+    for extra, (_, use) in extras.items():
+        lines.append(f"  {extra}: {optional[extra] or 'not installed'} ({use})")
+    lines.append("registered")
+    lines += [f"  {len(names)} {kind}: {', '.join(names)}" for kind, names in registered.items()]
+    # What is known at once is said before the check.
+    print(*lines, "shipped report", sep="\n", flush=True)
+    checked, code = None, 0
+    if folder is None:
+        print("  none here: it is in the repository")
+    else:
+        outcome = _checked(folder, quick, opt.CORES)
+        code = outcome.exit_code
+        checked = {"folder": str(folder), "verdict": outcome.verdict, "exit_code": code}
+        print(f"  {folder}: {outcome.verdict}")
+    found = {**environment, "optional": optional, "registered": registered, "report": checked}
+    finish(code, found)

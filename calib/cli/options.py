@@ -1,25 +1,29 @@
-"""Shared options, the commands `data`, `template` and `priors`, and progress bars."""
+"""What commands share: options, progress bars, JSON, and what they say of emulated simulators."""
 
 from __future__ import annotations
 
+import io
+import json
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TextIO
 
 import typer
 
-from calib.errors import CalibError
-from calib.report.numbers import centre_text, interval_text
+from calib.report.numbers import finite
 
 if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
+    from rich.console import Console
+    from rich.progress import Progress
 
-    from calib.inference.calibration import Calibration
-    from calib.report.verdict import Verdict
+    from calib.data import Table
+    from calib.inference.emulation import Emulation
+
+type Tell = Callable[[str, int, int], None]
 
 Seed = Annotated[int, typer.Option(help="Same seed, same numbers.", min=0)]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an earlier result.")]
@@ -29,8 +33,11 @@ HoldOutOption = Annotated[
 ]
 MaxSteps = Annotated[int, typer.Option(help="Where extending the chains stops.", min=100)]
 PriorFiles = Annotated[list[Path] | None, typer.Option(help="Prior file of a model; repeatable.")]
-# As many processes as there are cores, of which two bring most of what there is to gain.
-CORES = min(2, os.cpu_count() or 1)
+EffectsFile = Annotated[
+    Path | None,
+    typer.Option("--effects", help="Python file with effects of your own, for this alone."),
+]
+CORES = min(2, os.cpu_count() or 1)  # more than two processes bring little
 Workers = Annotated[int, typer.Option(help="Processes on this machine.", min=1, max=1024)]
 Scheduler = Annotated[
     str | None,
@@ -46,24 +53,66 @@ def _load(paths: list[Path] | None) -> list[Path] | None:
     return paths
 
 
-def _files(name: str, what: str, *, first: bool) -> Any:
-    return typer.Option(name, help=f"{what}; repeatable.", callback=_load, is_eager=first)
-
-
 Models = Annotated[
     list[Path] | None,
-    _files(
+    typer.Option(
         "--models",
-        "Python file that registers quantities, models or effects of your own",
-        first=True,
+        help="Python file that registers quantities, models or effects of your own; repeatable.",
+        callback=_load,
+        is_eager=True,
     ),
 ]
 Simulators = Annotated[
     list[Path] | None,
-    _files(
-        "--simulator", "TOML file of a simulator of your own, whose command is run", first=False
+    typer.Option(
+        "--simulator",
+        help="TOML file of a simulator of your own, whose command is run; repeatable.",
+        callback=_load,
     ),
 ]
+
+
+class _Aside(io.TextIOBase):
+    """An output that forgets words for people, before the one that a program reads."""
+
+    def __init__(self, output: TextIO) -> None:
+        self.output = output
+
+    def write(self, text: str) -> int:
+        return len(text)
+
+
+def _set_aside(ctx: typer.Context, wanted: bool) -> bool:
+    if wanted:
+        ctx.with_resource(redirect_stdout(_Aside(sys.stdout)))
+    return wanted
+
+
+Json = Annotated[
+    bool,
+    typer.Option("--json", help="Print one JSON object in the place of words.",
+                 callback=_set_aside),
+]  # fmt: skip
+
+
+def finish(code: int, found: Mapping[str, Any] | Path, **more: Any) -> None:
+    """Say what the data are called, print JSON if it is asked for, and end with an exit code.
+
+    What is printed is a document, or the JSON file that holds it; `more` stands before it. What is
+    not finite is null.
+    """
+    from calib.data.reader import SEEN, said_of
+
+    if isinstance(sys.stdout, _Aside):
+        document = found if isinstance(found, Mapping) else json.loads(found.read_bytes())
+        data = {"data_label": ", ".join(SEEN)} if SEEN else {}
+        whole = finite({"exit_code": code, **more, **data, **document})
+        sys.stdout.output.write(json.dumps(whole, indent=1, allow_nan=False) + "\n")
+    for label in SEEN:
+        print(f"calib: {label} data: {said_of(label)}", file=sys.stderr)
+    SEEN.clear()
+    if code:
+        raise typer.Exit(code)
 
 
 def command() -> list[str]:
@@ -74,96 +123,15 @@ def command() -> list[str]:
 
 
 def announce(line: str) -> None:
-    """Say where the tasks are done."""
+    """Say something on the error output."""
     print(f"calib: {line}", file=sys.stderr)
 
 
-def data(
-    name: Annotated[str, typer.Argument(help="he2019 or he2019-gaps")],
-    out: Annotated[Path | None, typer.Option(help="Folder to write; its name if none.")] = None,
-    overwrite: Overwrite = False,
-) -> None:
-    """Write the embedded, reconstructed data as CSV files, or as cases for `calib diagnose`."""
-    writers = {"he2019": _write_he2019, "he2019-gaps": _write_he2019_gaps}
-    if name not in writers:
-        raise CalibError(
-            f"there is no data set {name!r}", expected=", ".join(writers), hint="use one of these"
-        )  # fmt: skip
-    folder = Path(name) if out is None else out
-    try:
-        written = writers[name](folder, overwrite)
-    except OSError as error:
-        raise CalibError(
-            f"the folder cannot be written ({error.strerror})", where=str(folder),
-            hint="choose another --out",
-        ) from None  # fmt: skip
-    for path in written:
-        print(f"{path} (reconstructed from published results, not measured)")
+def wide_console(width: int = 160) -> Console:
+    """Return a console for tables; a pipe has no width of its own."""
+    from rich.console import Console
 
-
-def _write_he2019(out: Path, overwrite: bool) -> list[Path]:
-    from calib.he2019 import embedded
-
-    existing = [f"{key}.csv" for key in embedded.tables() if (out / f"{key}.csv").exists()]
-    if existing and not overwrite:
-        raise CalibError(
-            f"{', '.join(existing)} exist there already", where=str(out),
-            hint="choose another --out, or pass --overwrite",
-        )  # fmt: skip
-    return embedded.write(out)
-
-
-def _write_he2019_gaps(out: Path, overwrite: bool) -> list[Path]:
-    from calib.he2019.gaps import paper_gaps, write_cases
-
-    return write_cases(paper_gaps(), out, overwrite=overwrite)
-
-
-def template(
-    model: Annotated[str, typer.Argument(help="See `calib models`.")],
-    out: Annotated[Path | None, typer.Option(help="CSV to write; printed if none.")] = None,
-    plugins: Models = None,
-    simulator: Simulators = None,
-) -> None:
-    """Write an example CSV of a model to fill in."""
-    from calib.models import get_model, template_csv
-
-    text = template_csv(get_model(model).name)
-    _emit(text, out)
-    if "run_order" in text:
-        print("calib: run_order may be left out: number the rows as they were measured, or delete "
-              "the column", file=sys.stderr)  # fmt: skip
-
-
-def priors(
-    model: Annotated[str, typer.Argument(help="See `calib models`.")],
-    out: Annotated[Path | None, typer.Option(help="TOML to write; printed if none.")] = None,
-    plugins: Models = None,
-    simulator: Simulators = None,
-) -> None:
-    """Write the shipped priors of a model, to copy and edit."""
-    from calib.inference.prior_files import default_priors
-    from calib.models import get_model
-
-    _emit(default_priors(get_model(model).name).read_text(encoding="utf-8"), out)
-
-
-def _emit(text: str, out: Path | None) -> None:
-    if out is None:
-        sys.stdout.write(text)
-        return
-    from calib.batch.folders import write_whole
-
-    try:
-        if out.exists():
-            raise CalibError("the file exists already", where=str(out), hint="choose another --out")
-        write_whole(out, text)
-    except OSError as error:
-        raise CalibError(
-            f"the file cannot be written ({error.strerror})", where=str(out),
-            hint="choose another --out",
-        ) from None  # fmt: skip
-    print(out)
+    return Console(width=None if sys.stdout.isatty() else width, highlight=False, markup=False)
 
 
 _log = logging.getLogger("calib")
@@ -189,9 +157,8 @@ def told() -> Iterator[None]:
 
 
 @contextmanager
-def progress_bars() -> Iterator[Callable[[str, int, int], None]]:
+def progress_bars() -> Iterator[Tell]:
     """Yield a callback ``(what, done, planned)`` that draws one bar for each kind of work."""
-    tasks: dict[str, TaskID] = {}
     shown: list[Progress] = []
 
     def tell(what: str, done: int, planned: int) -> None:
@@ -199,9 +166,9 @@ def progress_bars() -> Iterator[Callable[[str, int, int], None]]:
         if not shown:
             shown.append(_bars())
             shown[0].start()
-        if what not in tasks:
-            tasks[what] = shown[0].add_task(what, total=planned)
-        shown[0].update(tasks[what], completed=done, total=planned)
+        tasks = {task.description: task.id for task in shown[0].tasks}
+        task = tasks[what] if what in tasks else shown[0].add_task(what)
+        shown[0].update(task, completed=done, total=planned)
 
     try:
         yield tell
@@ -213,83 +180,92 @@ def progress_bars() -> Iterator[Callable[[str, int, int], None]]:
 
 
 def _bars() -> Progress:
-    # Late: many a command has nothing to tell.
+    from rich import progress
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        ProgressColumn,
-        Task,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
     from rich.text import Text
 
     from calib.data.files import plain_number
 
-    class _Speed(ProgressColumn):
-        def render(self, task: Task) -> Text:
+    class Speed(progress.ProgressColumn):
+        def render(self, task: progress.Task) -> Text:
             return Text("" if task.speed is None else f"{plain_number(task.speed, 2)}/s")
 
-    return Progress(
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
-        TimeElapsedColumn(), TimeRemainingColumn(), _Speed(), console=Console(stderr=True),
+    return progress.Progress(
+        progress.TextColumn("{task.description}"), progress.BarColumn(),
+        progress.MofNCompleteColumn(), progress.TimeElapsedColumn(),
+        progress.TimeRemainingColumn(), Speed(), console=Console(stderr=True),
     )  # fmt: skip
 
 
-def posterior_table(calibration: Calibration, judged: Verdict) -> None:
-    """Print a calibration's posterior as a table, in agreement with its verdict."""
-    from rich.console import Console
-    from rich.table import Table as RichTable
+def emulate(
+    models: Mapping[str, tuple[Table, Path | None]],
+    seed: int,
+    workers: int,
+    elsewhere: Iterable[Table | None] = (),
+) -> dict[str, Emulation]:
+    """Emulate the slow simulators among models, and say of each how good it is.
 
-    from calib.validation.assumptions import parameter_remarks
+    By model the rows that it is fitted to and its prior file; `elsewhere` it is to predict too.
+    """
+    from calib.inference.emulation.prepared import prepare
 
-    model = calibration.problem.bound.model
-    table = RichTable(title=f"{model.name}: posterior of {len(calibration.problem.table)} rows")
-    words, numbers = ("parameter", "unit"), ("mean ± sd or median", "95 % HDI", "ESS bulk/tail")
-    for heading in (*words, *numbers, "R-hat", "remark"):
-        table.add_column(heading, justify="left" if heading in (*words, "remark") else "right")
-    remarks = parameter_remarks(calibration, judged.remarks)
-    for s in calibration.summary.values():
-        table.add_row(
-            s.name, s.unit, centre_text(s),
-            interval_text(s), f"{s.ess_bulk:.0f}/{s.ess_tail:.0f}",
-            f"{s.rhat:.3f}", remarks[s.name],
-        )  # fmt: skip
-    # A pipe has no width of its own: wide enough for whole rows.
-    width = None if sys.stdout.isatty() else 120
-    Console(width=width).print(table)
-
-
-def tell_verdict(found: Verdict, of: str = "") -> None:
-    """Print a verdict, the warnings behind it first."""
-    for warning in found.warnings:
-        print(f"warning: {of}{warning}", file=sys.stderr)
-    for line in found.lines:
-        print(f"{of}{line}")
+    others = [table for table in elsewhere if table is not None]
+    with progress_bars() as tell:
+        found = {
+            name: prepare(
+                name, table, seed, priors=path, elsewhere=others, workers=workers, progress=tell
+            )
+            for name, (table, path) in models.items()
+        }
+    emulations = {name: emulation for name, emulation in found.items() if emulation is not None}
+    for name, emulation in emulations.items():
+        say(name, emulation)
+    return emulations
 
 
-def tell_compared(found: Mapping[str, Any]) -> None:
-    """Print the verdict on each model of a comparison, as `comparison.json` has it."""
-    from calib.report.verdict import Verdict
+def say(model: str, emulation: Emulation) -> None:
+    """Say what became of an emulation."""
+    from calib.data.files import plain_number
+    from calib.report.sections import coverage_words
 
-    for name, model in found["models"].items():
-        tell_verdict(Verdict.of(model["verdict"]), f"{name}: ")
-
-
-def verdict_line(calibration: Calibration) -> str:
-    """Say whether a calibration passed the gate, and what to do if not."""
-    report = calibration.draws.report
-    if report.passed:
-        return (
-            f"converged: {calibration.draws.t.shape[0]} ensembles, {report.steps} steps, "
-            f"R-hat at most {report.rhat.max():.4f}, ESS at least "
-            f"{min(report.ess_bulk.min(), report.ess_tail.min()):.0f}"
+    h = emulation.held_out
+    seen = "" if h is None else (
+        f"; on {h.runs} runs not seen it is off by {h.rmse:.3f} noise sds (rms); of their values "
+        f"its 90 % intervals hold {coverage_words(h.covered, h.pit.size)}"
+    )  # fmt: skip
+    n = len(emulation.runs)
+    print(f"{model}: emulated {f'with {n} more' if emulation.extended else f'from {n}'} runs{seen}")
+    if emulation.own_noise:
+        sd = plain_number(emulation.own_noise)
+        print(f"{model}: the simulator has a noise of its own, sd {sd}")
+    if emulation.failed:
+        first = emulation.failed[0].failure
+        why = "" if first is None else f", the first as {first.reason}"
+        announce(
+            f"{len(emulation.failed)} of {len(emulation.runs)} runs failed{why}; they are "
+            "listed beside the runs, and the posterior keeps out of where there is no value"
         )
-    return (
-        "NOT CONVERGED, do not use these numbers: "
-        + "; ".join(report.reasons[:3])
-        + ". Raise --max-steps, or give tighter priors for parameters the data do not determine."
+    for reason in emulation.reasons:
+        print(f"EMULATOR NOT GOOD ENOUGH: {reason}")
+
+
+def say_failed(model: str) -> None:
+    """Say which runs failed of a simulator that the sampler asked itself, and list them."""
+    from calib.inference.emulation.prepared import write_failed
+    from calib.models import get_model
+    from calib.models.simulators.registered import Direct, simulated_by
+
+    direct, found = get_model(model).predict, simulated_by(model)
+    if not isinstance(direct, Direct) or found is None or not direct.tally.failed:
+        return
+    tally, listed = direct.tally, ""
+    if found.folder is not None:
+        path = found.folder / f"{model}-failed.csv"
+        write_failed(tally.failed, direct.simulator.parameters, path)
+        listed = f"; the first {len(tally.failed)} are listed in {path}"
+    first = tally.failed[0].failure
+    announce(
+        f"{tally.lost} of {tally.made} runs failed, the first as "
+        f"{'' if first is None else first.reason}{listed}; the posterior keeps out of where there "
+        "is no value"
     )

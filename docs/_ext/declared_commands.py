@@ -7,7 +7,7 @@ from typing import Any
 import typer
 from declared_text import code, table, words
 
-from calib.cli.verbs import app
+from calib.cli.app import app
 
 
 def page() -> str:

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from calib.batch.campaign import read_plan
-from calib.cli.verbs import app
+from calib.cli.app import app
 from calib.data import read_table
 from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError

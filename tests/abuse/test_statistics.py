@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from calib.cli.verbs import app
+from calib.cli.app import app
 from calib.data import read_for_model, table_from_arrays
 from calib.data.checks import beyond_notes, column_notes
 from calib.errors import CalibError

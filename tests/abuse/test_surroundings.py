@@ -32,7 +32,7 @@ from calib.batch.foreign import call, set_apart
 from calib.batch.plugins import run_file
 from calib.batch.pool import pool
 from calib.cli import _readable
-from calib.cli.verbs import app
+from calib.cli.app import app
 from calib.data.files import decoded, read_json
 from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
@@ -891,7 +891,7 @@ def test_a_run_that_is_doubled_in_a_table_is_named(tmp_path: Path) -> None:
 
 def test_an_interruption_says_what_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
     """After the folder is written, while its numbers are printed."""
-    monkeypatch.setattr("calib.cli.options.posterior_table", interrupt)
+    monkeypatch.setattr("calib.cli.calibration.posterior_table", interrupt)
     done = run(*FIT)
     assert done.exit_code == 130
     assert "nothing was written" not in done.stderr

@@ -16,7 +16,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from calib.batch.folders import claimed, fresh_folder
-from calib.cli.verbs import app
+from calib.cli.app import app
 from calib.errors import CalibError
 from calib.models import example_csv
 from challenge.seal import KEY_SCHEMA, publish, seal

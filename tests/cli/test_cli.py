@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from calib.cli import main
+from calib.data.reader import SEEN
 from calib.inference.prior_files import default_priors
 from calib.models import MODELS, example_csv, template_csv
 from calib.report.figures.collect import plates
@@ -44,6 +45,7 @@ def calib(
 
     def run(*arguments: object) -> Ran:
         monkeypatch.setattr(sys, "argv", ["calib", *map(str, arguments)])
+        SEEN.clear()  # a process runs one command
         capsys.readouterr()
         with pytest.raises(SystemExit) as ended:
             main()

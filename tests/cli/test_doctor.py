@@ -45,7 +45,7 @@ def test_that_a_whole_check_follows_is_said_first(
     def stopped(*_: object, **__: object) -> None:
         raise CalibError("stopped in the middle")
 
-    monkeypatch.setattr("calib.cli.machine._checked", stopped)
+    monkeypatch.setattr("calib.cli.check._checked", stopped)
     told = calib("doctor", "--report", run)
     first, second = told.err.splitlines()
     assert first == (

@@ -6,18 +6,16 @@ import json
 import os
 import shlex
 import shutil
-import signal
 import subprocess
 import sys
-import time
-from importlib.metadata import entry_points, version
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 import typer
 
 import calib as package
-from calib.cli.verbs import EXAMPLES, app
+from calib.cli.app import app
 from calib.models import MODELS, example_csv
 from tests.cli.test_cli import Calib
 from tests.cli.test_cli import calib as calib
@@ -91,7 +89,7 @@ def test_what_is_not_finite_is_null(capsys: pytest.CaptureFixture[str]) -> None:
     from contextlib import redirect_stdout
     from sys import stdout
 
-    from calib.cli.machine import _Aside, finish
+    from calib.cli.options import _Aside, finish
 
     with redirect_stdout(_Aside(stdout)):
         print("for people")
@@ -119,10 +117,6 @@ def test_every_help_has_an_example_that_is_understood(verb: str) -> None:
     assert typed.startswith(f"calib {verb} ")
     with command.make_context(verb, typed.removeprefix(f"calib {verb} ").split()):
         pass
-
-
-def test_no_example_is_of_nothing() -> None:
-    assert {verb.split()[-1] for verb in verbs()} == set(EXAMPLES)
 
 
 def test_the_version(calib: Calib) -> None:
@@ -154,92 +148,16 @@ def test_an_interruption_says_how_to_go_on(calib: Calib, monkeypatch: pytest.Mon
     assert not Path("calib-run").exists()
 
 
-def test_an_interruption_in_a_callback_is_not_lost(
-    calib: Calib, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Python reports what a finaliser raises, and goes on."""
-
-    class Finalised:
-        def __del__(self) -> None:
-            raise KeyboardInterrupt
-
-    def stopped(*_: object, **__: object) -> None:
-        Finalised()
-        time.sleep(60.0)
-
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    monkeypatch.setattr("calib.inference.calibration.calibrate", stopped)
-    Path("my.csv").write_text(example_csv("bekker"))
-    try:
-        ran = calib("fit", "my.csv", "--model", "bekker")
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert ran.code == 130
-    assert "interrupted" in ran.err
-
-
-def test_a_program_ends_at_once_however_it_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Python would take half a second to give back what it holds."""
-    (script,) = entry_points(group="console_scripts", name="calib")
-    left: list[int] = []
-    monkeypatch.setattr("calib.cli.os._exit", left.append)
-    monkeypatch.setattr("calib.cli.atexit._run_exitfuncs", lambda: None)
-    monkeypatch.setattr("calib.cli._others_at_work", lambda: False)
-    for code in (130, 0, None, 3):
-        monkeypatch.setattr("calib.cli.main", lambda code=code: sys.exit(code))
-        script.load()()
-    assert left == [130, 0, 0, 3]
-    monkeypatch.setattr("calib.cli.main", lambda: sys.exit("words"))
-    with pytest.raises(SystemExit, match="words"):
-        script.load()()
-
-
 ENDING = """
-import atexit, sys, threading, time
-import calib.cli
-atexit.register(print, "at exit")
-def main():
-    print("x" * 100_000)
+import sys
+import calib.cli, calib.cli.app
+def app(**_):
+    print("x" * 10)
     sys.exit(3)
-calib.cli.main = main
+calib.cli.app.app = app
+calib.cli.main()
 """
-# What the interpreter waits for and writes by itself.
-BESIDE = {
-    "nothing": ("", []),
-    "a thread": (
-        """
-def late():
-    time.sleep(0.3)
-    print("a thread")
-threading.Thread(target=late).start()
-""",
-        ["a thread"],
-    ),
-    "an idle worker": (
-        """
-from concurrent.futures import ThreadPoolExecutor
-executor = ThreadPoolExecutor(1)
-executor.submit(int).result()
-""",
-        [],
-    ),
-}
 BUFFERED = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"}
-
-
-def ending(text: str) -> list[str]:
-    return [sys.executable, "-c", f"{text}\ncalib.cli.program()"]
-
-
-@pytest.mark.parametrize("beside", BESIDE)
-def test_nothing_is_lost_where_a_program_ends(beside: str) -> None:
-    text, more = BESIDE[beside]
-    ran = subprocess.run(
-        ending(ENDING + text), capture_output=True, text=True, check=False, timeout=60
-    )
-    assert ran.returncode == 3
-    assert sorted(ran.stdout.splitlines()) == sorted(["x" * 100_000, "at exit", *more])
-    assert ran.stderr == ""
 
 
 def test_what_code_of_ones_own_has_open_is_written(tmp_path: Path) -> None:
@@ -256,7 +174,7 @@ def test_what_code_of_ones_own_has_open_is_written(tmp_path: Path) -> None:
 @pytest.mark.skipif(sys.platform == "win32", reason="of a shell")
 @pytest.mark.parametrize(("to", "code"), [(">&-", 3), ("2>&-", 3), (">/dev/full", 2)])
 def test_without_a_place_to_write_to_the_exit_code_says_it(to: str, code: int) -> None:
-    command = shlex.join(ending(ENDING.replace("100_000", "10")))
+    command = shlex.join([sys.executable, "-c", ENDING])
     ran = subprocess.run(
         f"{command} {to}", shell=True, capture_output=True, text=True, check=False, env=BUFFERED
     )
@@ -278,11 +196,10 @@ def test_a_job_that_closed_its_output_is_told_the_same(tmp_path: Path) -> None:
         assert (ran.returncode, "Traceback" in ran.stderr) == (0, False), ran.stderr
 
 
-@pytest.mark.parametrize("beside", BESIDE)
-def test_a_reader_that_has_gone_is_no_error(beside: str) -> None:
+def test_a_reader_that_has_gone_is_no_error() -> None:
     """As `calib models | head -1` has it: what is still to be written has nowhere to go."""
     with subprocess.Popen(
-        ending(ENDING.replace("100_000", "10") + BESIDE[beside][0]),
+        [sys.executable, "-c", ENDING],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -294,7 +211,7 @@ def test_a_reader_that_has_gone_is_no_error(beside: str) -> None:
         assert process.stderr.read() == ""
 
 
-@pytest.mark.parametrize("module", ["calib.cli.verbs", "typer", "calib.inference.problem"])
+@pytest.mark.parametrize("module", ["calib.cli.app", "typer", "calib.inference.problem"])
 def test_an_interruption_while_it_imports_says_how_to_go_on(module: str, tmp_path: Path) -> None:
     code = f"""
 import os, signal, sys

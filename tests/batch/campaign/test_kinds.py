@@ -13,7 +13,7 @@ import pytest
 from calib.batch.campaign import read_plan, run_campaign
 from calib.batch.campaign.kinds import KINDS
 from calib.check.check import check
-from calib.cli.simulators import prepare_case
+from calib.cli.gap import prepare_case
 from calib.data import hold_out, read_table
 from calib.errors import CalibError
 from calib.gap.batch import diagnose_cases
@@ -172,7 +172,7 @@ def test_cases_of_a_slow_simulator_are_diagnosed_side_by_side(wheel, tmp_path):
     # With the runs that are kept the verb gives the same.
     case = read_case(tmp_path / "cases" / "case-0")
     seed = read_plan(tmp_path / "plan.toml").tasks["a.cases-case-0"].seed
-    prepare_case(case, None, seed, 1, lambda what, done, planned: None)
+    prepare_case(case, None, seed, 1)
     found = diagnose(case, seed)
     assert found.ranking.probability["slip_zero_shift"] == pytest.approx(
         shifted["probability"], abs=0.02

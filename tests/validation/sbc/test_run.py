@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from calib.cli.verbs import app
+from calib.cli.app import app
 from calib.errors import CalibError
 from calib.inference.diagnostics import Gate
 from calib.inference.prior_files import default_priors
