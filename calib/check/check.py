@@ -47,11 +47,11 @@ from calib.report.comparison import (
     problem_of,
     recompute_comparison,
 )
+from calib.report.document import summarise_estimates
 from calib.report.publish import publication
 from calib.report.sections import SECTIONS, work_out
 from calib.report.study import Progress, Study, estimate_task
 from calib.report.study_tasks import Task, fitted_rows
-from calib.report.summary import summarise_estimates
 from calib.report.writer import write_report
 from calib.validation.comparison import stacking_weights
 from calib.validation.validate import Place

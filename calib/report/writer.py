@@ -21,13 +21,13 @@ from calib.inference.prior_files import default_priors
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import get_model
 from calib.models.simulators.emulator import emulator_of, save_emulator
+from calib.report.document import summarise
 from calib.report.figures.collect import draw
 from calib.report.page.content import render_page
 from calib.report.publish import publication
 from calib.report.sections import Report, Target
 from calib.report.study import OutputResult, Progress, Study
 from calib.report.study_tasks import Task
-from calib.report.summary import summarise
 
 SCHEMA = "calib/manifest/2"
 
@@ -41,11 +41,15 @@ def file_hashes(folder: Path) -> dict[str, str]:
     }
 
 
-def _manifest(
+def build_manifest(
     report: Report, settings: SamplerSettings, command: Sequence[str], title: str,
     environment: Environment, inputs: Mapping[str, Mapping[str, Any]],
 ) -> dict[str, Any]:  # fmt: skip
-    """Return what it takes to make the report again; ``seconds`` alone differ between two runs."""
+    """Return what it takes to make a report again, its file hashes still to be added.
+
+    `inputs` are for every output the files its data and priors were copied to, and their hashes.
+    ``seconds`` is the one place of a report that holds durations, which no two runs share.
+    """
     study = report.study
     return {
         "schema": SCHEMA,
@@ -116,7 +120,7 @@ def write_report(
         (folder / "figures").mkdir()
         drawing = {key: pool.submit(draw, key, r, pdf=pdf) for key, r in study.successes.items()}
         kept = [pool.submit(_keep, key, r, folder) for key, r in study.successes.items()]
-        manifest = _manifest(
+        manifest = build_manifest(
             report, settings, command, title, where, _copy_inputs(study, folder)
         ) | {"pdf": pdf}  # fmt: skip
         summary = summarise(study)
@@ -140,7 +144,7 @@ def write_report(
         tell("drawing figures", len(drawing), len(drawing))
         for netcdf in kept:
             netcdf.result()
-        page = render_page(study, drawn, manifest=manifest, more=more, paper=paper)
+        page = render_page(study, drawn, manifest=manifest, summary=summary, more=more, paper=paper)
         (folder / "index.html").write_text(page, encoding="utf-8")
         files = file_hashes(folder)
         left_out = [] if posteriors else [f"{key}.nc" for key in study.successes]

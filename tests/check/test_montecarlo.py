@@ -14,8 +14,8 @@ from calib.check.tolerances import (
     posterior_errors,
 )
 from calib.he2019.designs import he2019_tasks
+from calib.report.document import summarise
 from calib.report.sections import work_out
-from calib.report.summary import summarise
 
 
 @pytest.mark.parametrize("n", [1, 54, 400])

@@ -24,9 +24,9 @@ from calib.he2019.designs import he2019_tasks
 from calib.he2019.gaps import paper_gaps
 from calib.he2019.sections import AuditSection, GapsSection
 from calib.inference.sampling.sampler import SamplerSettings
+from calib.report.document import summarise
 from calib.report.sections import work_out
 from calib.report.study_tasks import Task
-from calib.report.summary import summarise
 from calib.report.writer import file_hashes, write_report
 from calib.validation.sbc import run_sbc
 

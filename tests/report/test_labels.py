@@ -17,8 +17,7 @@ from calib.report.labels import (
     unit_text,
     units_of,
 )
-from calib.report.page.template import unit_html
-from calib.report.publish.markup import latex_unit
+from calib.report.publish.markup import latex_unit, unit_html
 
 MINUS = "\N{MINUS SIGN}"
 TIMES = "\N{MULTIPLICATION SIGN}"

@@ -20,10 +20,10 @@ from calib.he2019.embedded import load_he2019
 from calib.he2019.published import PUBLISHED
 from calib.inference.prior_files import default_priors
 from calib.inference.sampling.sampler import SamplerSettings
+from calib.report.document import summarise
 from calib.report.sections import work_out
 from calib.report.study import Failure, OutputResult, Study
 from calib.report.study_tasks import Task, plan_tasks
-from calib.report.summary import summarise
 from calib.report.writer import build_manifest, file_hashes
 from tests.user_tables import pulls, table
 

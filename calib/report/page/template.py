@@ -4,31 +4,19 @@ from __future__ import annotations
 
 import base64
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import cache
 from pathlib import PurePosixPath
-from string import ascii_letters
 from typing import Any
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, Template
-from markupsafe import Markup, escape
+from markupsafe import Markup
 
 from calib.data.reader import said_of
-from calib.inference.problem import Problem
 from calib.models import BoundModel
 from calib.models.latex import html
 from calib.report.figures.plate import Plate
-from calib.report.labels import (
-    MINUS,
-    axis_of,
-    degrees,
-    joined,
-    percent,
-    plain,
-    short,
-    stem_and_subscript,
-    unbroken,
-)
+from calib.report.labels import MINUS, joined, percent, short, unbroken
 from calib.report.numbers import (
     format_number,
     format_value,
@@ -107,39 +95,6 @@ def picture(plate: Plate, image: bytes, caption: str) -> dict[str, Any]:
     }
 
 
-def symbol_html(name: str) -> Markup:
-    """Return a parameter's symbol: ``K_lo`` as K with a subscript."""
-    stem, below = stem_and_subscript(name)
-    inside = Markup("<i>{}</i>").format(plain(stem))
-    return inside + Markup("<sub>{}</sub>").format(below) if below else inside
-
-
-def unit_html(unit: str) -> Markup:
-    """Return a unit with its powers raised; a dash where there is none."""
-    if unit in ("1", ""):
-        return Markup("&ndash;")
-    raised = re.sub(r"\^(-?)(\w+)", r"<sup>\1\2</sup>", str(escape(degrees(unit))))
-    return Markup(raised.replace("<sup>-", "<sup>&minus;"))
-
-
-def prose(text: str, names: Iterable[str]) -> Markup:
-    """Escape a sentence and set the parameters in it as symbols.
-
-    Single letters stay as they are: a lone C or n may be a word of the sentence.
-    """
-    spellings = {plain(name): name for name in names} | {name: name for name in names}
-    telling = sorted((s for s in spellings if len(s) > 1 or s not in ascii_letters), key=len)
-    escaped = str(escape(unbroken(text)))
-    if telling:
-        pattern = "|".join(re.escape(s) for s in reversed(telling))
-        escaped = re.sub(
-            rf"(?<![\w/])({pattern})(?!\w)",
-            lambda match: str(symbol_html(spellings[match.group()])),
-            escaped,
-        )
-    return Markup(escaped)
-
-
 def equation(bound: BoundModel) -> Markup:
     """Return the equation of a model."""
     model = bound.model
@@ -147,30 +102,6 @@ def equation(bound: BoundModel) -> Markup:
     number = model.numbers.replace("-", "\N{EN DASH}")
     mark = Markup(" <span class='eq'>({})</span>").format(number) if number else ""
     return Markup("{}{}").format(written, mark)
-
-
-def likelihood(problem: Problem, output: str) -> str:
-    """Say what the likelihood is."""
-    noise = problem.noise
-    what = f"the logarithm of {output}" if problem.bound.model.response == "log" else output
-    law, scale = ("normal", "standard deviation")
-    if noise.student:
-        law, scale = "Student-t, of unknown degrees of freedom nu,", "scale"
-    rows = "Rows are independent"
-    if noise.choice.correlated_along:
-        rows = (
-            f"Rows are correlated along {noise.choice.correlated_along}, by rho to the power of "
-            "how many rows they are apart"
-        )
-    text = f"{rows}; {what} is {law} about the prediction, with "
-    if not noise.column:
-        return f"{text}one unknown {scale} sigma for all rows."
-    column = axis_of(noise.column)
-    return (
-        f"{text}a {scale} that is sigma at the mean {column.name.lower()} of the rows, "
-        f"{column.value_text(noise.centre)} {column.unit}, and whose logarithm changes by "
-        f"sigma_slope for each sd of it, {column.value_text(noise.spread)} {column.unit}."
-    )
 
 
 def parametrisation(bound: BoundModel) -> str:

@@ -6,45 +6,44 @@ byte, wherever these are the same.
 
 from __future__ import annotations
 
+import re
+import shlex
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from calib.report.publish.markup import bibliography, bibtex, cited, to_latex, to_text
-from calib.report.publish.records import (
-    LatexTable,
-    Output,
-    Paragraph,
-    Row,
-    convergence_csv,
-    convergence_latex,
-    methods,
-    outputs,
-    validation_csv,
-    validation_latex,
-    write_csv,
-    write_latex,
-)
-from calib.report.publish.tables import (
-    estimates_csv,
-    estimates_latex,
-    posterior_csv,
-    posterior_latex,
-    pressure_latex,
-    priors_csv,
-    priors_latex,
-)
+from jinja2 import UndefinedError
 
-_WIDTH = 96
+from calib.data.reader import KNOWN_DATA
+from calib.inference.estimators import METHODS
+from calib.report.document import Output, outputs
+from calib.report.labels import joined
+from calib.report.numbers import format_number, format_value
+from calib.report.page.template import template
+from calib.report.publish.markup import bibliography, bibtex, cited, to_latex, to_text
+from calib.report.publish.tables import Table, csv_tables, latex_tables, write_csv
+
+type Paragraph = tuple[str, tuple[str, ...]]
+"""A heading, empty for the first, and sentences with marks (`calib.report.publish.markup`)."""
+
+_NORMAL: Mapping[str, Any] = {
+    "family": "", "correlated_along": "", "depends_on": None, "against_normal": None,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Publication:
-    """What a paper takes from a report: text by path in its folder.
+    """What a paper takes from a report.
 
-    And heading, empty for the first, and text of every paragraph of the methods; a line for every
-    reference that they cite.
+    Parameters
+    ----------
+    files : mapping of str to str
+        Text by path in the report's folder.
+    methods : tuple of (str, str)
+        Heading, empty for the first, and text of every paragraph of the methods.
+    references : tuple of str
+        A line for every reference that they cite.
     """
 
     files: Mapping[str, str]
@@ -55,8 +54,8 @@ class Publication:
         """Return topic, CSV file and LaTeX files of every table."""
         topics = []
         for path in self.files:
-            if path.endswith(".csv"):
-                stem = path.removesuffix(".csv")
+            stem, _, form = path.rpartition(".")
+            if form == "csv":
                 tex = tuple(p for p in self.files if p.startswith(stem) and p.endswith(".tex"))
                 topics.append((stem.removeprefix("tables/").capitalize(), path, tex))
         return topics
@@ -72,78 +71,92 @@ def publication(manifest: Mapping[str, Any], summary: Mapping[str, Any]) -> Publ
         return Publication({}, (), ())
     version = str(manifest["versions"]["terracalib"])
     paragraphs = methods(manifest, found)
-    tables = [_labelled(t, found) for t in _latex_tables(found, manifest["settings"]["gate"])]
-    said = [sentence for _, sentences in paragraphs for sentence in sentences]
-    keys = cited([*said, *(t.caption for t in tables)])
-    references = bibliography(cited(said), version)
-    files = {f"tables/{name}.csv": write_csv(t) for name, t in _csv_tables(found).items() if t}
-    files |= {f"tables/{t.label}.tex": write_latex(t) for t in tables}
-    files["methods.txt"] = _text(paragraphs, references)
-    files["methods.tex"] = _tex(paragraphs)
-    files["references.bib"] = bibtex(keys, version)
-    return Publication(
-        files,
-        tuple((heading, " ".join(map(to_text, sentences))) for heading, sentences in paragraphs),
-        tuple(references),
-    )
-
-
-def _labelled(table: LatexTable, found: Sequence[Output]) -> LatexTable:
-    """Say of a table what its data must be called, unless its caption does."""
     label = ", ".join(dict.fromkeys(o.label for o in found if o.label))
+    tables = [_labelled(t, label) for t in latex_tables(found, manifest["settings"]["gate"])]
+    said = [sentence for _, sentences in paragraphs for sentence in sentences]
+    references = bibliography(cited(said), version)
+    texts = [(heading, " ".join(map(to_text, sentences))) for heading, sentences in paragraphs]
+    files = {f"tables/{name}.csv": write_csv(t) for name, t in csv_tables(found).items() if t}
+    files |= {f"tables/{t.label}.tex": t.latex() for t in tables}
+    files["methods.txt"] = _text(texts, references)
+    files["methods.tex"] = _tex(paragraphs)
+    files["references.bib"] = bibtex(cited([*said, *(t.caption for t in tables)]), version)
+    return Publication(files, tuple(texts), tuple(references))
+
+
+def _labelled(table: Table, label: str) -> Table:
+    """Say of a table what its data must be called, unless its caption does."""
     if label in table.caption:
         return table
     return replace(table, caption=f"{table.caption} {label.capitalize()} data.")
 
 
-def _csv_tables(found: Sequence[Output]) -> dict[str, list[Row]]:
-    labels = {o.key: o.label for o in found}
-    return {
-        name: [
-            {"output": row["output"], "data_label": labels[row["output"]], **row} for row in rows
-        ]
-        if any(labels.values())
-        else rows
-        for name, rows in _rows(found).items()
-    }
-
-
-def _rows(found: Sequence[Output]) -> dict[str, list[Row]]:
-    return {
-        "posterior": posterior_csv(found),
-        "estimates": estimates_csv(found),
-        "validation": validation_csv(found),
-        "convergence": convergence_csv(found),
-        "priors": priors_csv(found),
-    }
-
-
-def _latex_tables(found: Sequence[Output], gate: Mapping[str, float]) -> list[LatexTable]:
-    made = [
-        *(posterior_latex(o) for o in found),
-        *(estimates_latex(o) for o in found),
-        *(pressure_latex(o) for o in found),
-        validation_latex(found),
-        convergence_latex(found, gate),
-        *(priors_latex(o) for o in found),
+def methods(manifest: Mapping[str, Any], found: Sequence[Output]) -> list[Paragraph]:
+    """Return the methods; a KeyError where manifest or summary lack a number."""
+    labels = sorted({o.label for o in found if o.label})
+    try:
+        text = template("methods.j2", __name__, html=False).render(
+            v=manifest["versions"], s=manifest["settings"], ga=manifest["genetic_algorithm"],
+            seed=manifest["seed"], command=shlex.join(map(str, manifest["command"])),
+            labels=[label for label in labels if label in KNOWN_DATA], known=KNOWN_DATA,
+            genetic=any("genetic" in o.found["estimates"] for o in found),
+            digits=12,  # of a hash, which tell two files apart; the manifest has all of them
+            outputs=[(o, _words(o)) for o in found], format_value=format_value,
+        )  # fmt: skip
+    except UndefinedError as error:
+        raise KeyError(str(error)) from None
+    blocks = [_one_line(block) for block in re.split(r"\n\s*\n", text) if block.strip()]
+    starts = [0, *(i for i, block in enumerate(blocks) if block.startswith("# "))]
+    return [
+        (blocks[a][2:] if a else "", tuple(blocks[a + bool(a) : b]))
+        for a, b in zip(starts, [*starts[1:], len(blocks)], strict=True)
     ]
-    return [table for table in made if table is not None]
 
 
-def _text(paragraphs: Sequence[Paragraph], references: Sequence[str]) -> str:
-    blocks = []
-    for heading, sentences in paragraphs:
-        body = " ".join(map(to_text, sentences))
-        blocks.append(_filled(f"{heading}. {body}" if heading else body))
+def likelihood(o: Output) -> str:
+    """Say what the likelihood of an output is, with marks."""
+    noise = _NORMAL | o.found.get("noise", {})
+    text = template("likelihood.j2", __name__, html=False).render(o=o, noise=noise)
+    return _one_line(text)
+
+
+def _one_line(text: str) -> str:
+    return re.sub(r"[ \n]+", " ", text).strip()
+
+
+def _words(o: Output) -> dict[str, Any]:
+    """What is said of an output beside what stands in its records."""
+    v, axis = o.found["validation"], o.axis()
+    posterior = o.found["posterior"].items()
+    sampled = [f"[${n}]" for n, p in posterior if p["posterior_to_prior_sd"] is not None]
+    return {
+        "likelihood": likelihood(o),
+        "noise": _NORMAL | o.found.get("noise", {}),
+        "ranges": [_range(o, name, r) for name, r in o.found["data"]["ranges"].items()],
+        "sampled": joined(sampled),
+        "methods": [METHODS[m].words if m in METHODS else m for m in o.found["estimates"]],
+        "rmse": f"{format_number(axis.factor * (v['rmse'] or 0.0))} {axis.unit}",
+        "levels": [f"{level} %" for level in v["coverage"]],
+        "hits": [str(o.hits(level)) for level in v["coverage"]],
+    }
+
+
+def _range(o: Output, column: str, found: Mapping[str, float]) -> str:
+    axis = o.axis(column)
+    low, high = axis.value_text(found["lower"]), axis.value_text(found["upper"])
+    both = {1: low, 2: f"{low} and {high}"}.get(int(found["distinct"]), f"{low} to {high}")
+    return f"{axis.name[0].lower()}{axis.name[1:]} {both} {axis.unit}"
+
+
+def _text(paragraphs: Sequence[tuple[str, str]], references: Sequence[str]) -> str:
+    blocks = [_filled(f"{heading}. {body}" if heading else body) for heading, body in paragraphs]
     lines = [_filled(line, subsequent_indent="  ") for line in references]
     return "\n\n".join(["Methods", *blocks, "References", "\n".join(lines)]) + "\n"
 
 
 def _filled(text: str, **kwargs: Any) -> str:
     """Wrap lines at plain spaces; the others become plain once they have done their work."""
-    wrapped = textwrap.fill(
-        text, _WIDTH, break_long_words=False, break_on_hyphens=False, **kwargs
-    )  # fmt: skip
+    wrapped = textwrap.fill(text, 96, break_long_words=False, break_on_hyphens=False, **kwargs)
     return wrapped.replace("\N{NO-BREAK SPACE}", " ")
 
 

@@ -1,8 +1,9 @@
-"""Sentences with citations, symbols, equations and file names, for two readers.
+"""Sentences with citations, symbols, equations and file names, for three readers.
 
 A sentence is plain text with marks: ``[@key]`` or ``[@key; @other]`` cites, ``[$name]`` is a
-parameter's symbol, ``[u:unit]`` a unit, ``[=model]`` a model's equation, and backquotes enclose
-file names, hashes and commands. `to_text` writes it for any editor, `to_latex` for LaTeX.
+parameter's symbol, ``[u:unit]`` a unit, ``[=model]`` a model's equation, ``[!words]`` are strong,
+and backquotes enclose file names, hashes and commands. `to_text` writes it for any editor,
+`to_html` for a page, `to_latex` for LaTeX.
 
 The references are read from `references.bib`. Authors, volumes and pages are those that the
 packages and journals give themselves (the citation files of NumPy, SciPy, Matplotlib, emcee and
@@ -13,13 +14,24 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
 from importlib import resources
 
+from markupsafe import Markup
+from markupsafe import escape as html_escape
+
 from calib.models import get_model
-from calib.models.latex import text
-from calib.report.labels import joined, plain, symbol, unbroken, unit_plain, unit_text
+from calib.models.latex import html, text
+from calib.report.labels import (
+    degrees,
+    plain,
+    stem_and_subscript,
+    symbol,
+    unbroken,
+    unit_plain,
+    unit_text,
+)
 
 _SPECIAL = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
@@ -172,76 +184,95 @@ def _spelled(text: str) -> str:
     return known.replace("--", "\N{EN DASH}").replace("{", "").replace("}", "")
 
 
-_MARK = re.compile(r"\[@([^\]]+)\]|\[\$(\w+)\]|\[u:([^\]]*)\]|\[=(\w+)\]|`([^`]*)`")
+_MARK = re.compile(r"\[@([^\]]+)\]|\[\$(\w+)\]|\[u:([^\]]*)\]|\[=(\w+)\]|\[!([^\]]*)\]|`([^`]*)`")
 
 
 def cited(sentences: Iterable[str]) -> list[str]:
     """Return the keys that are cited, each once, in order."""
-    keys = [
-        key.strip(" @")
-        for sentence in sentences
-        for match in _MARK.finditer(sentence)
-        if match[1]
-        for key in match[1].split(";")
-    ]
-    return list(dict.fromkeys(keys))
+    marks = (match for sentence in sentences for match in _MARK.finditer(sentence) if match[1])
+    return list(dict.fromkeys(key for match in marks for key in _keys(match[1])))
 
 
-def joined_symbols(names: Iterable[str]) -> str:
-    """Return marks of several symbols, as a sentence lists them."""
-    return joined([f"[${name}]" for name in names])
-
-
-def in_brackets(unit: str) -> str:
-    """Return the mark of a unit that follows what it is of; nothing where there is none."""
-    return "" if unit in ("1", "") else f" ([u:{unit}])"
+def _keys(mark: str) -> list[str]:
+    return [key.strip(" @") for key in mark.split(";")]
 
 
 def with_symbols(text: str, names: Iterable[str]) -> str:
     """Mark the parameters in a text by others; a lone letter may be a word of it, and stays."""
-    known = sorted((n for n in names if len(n) > 1), key=len, reverse=True)
     text = text.replace("^2", "\N{SUPERSCRIPT TWO}").replace("^3", "\N{SUPERSCRIPT THREE}")
+    spelt = {spelling: name for name in names for spelling in (plain(name), name)}
+    known = sorted((s for s in spelt if len(s) > 1 or not s.isascii()), key=len, reverse=True)
     if not known:
         return text
-    pattern = rf"(?<![\w/])({'|'.join(map(re.escape, known))})(?!\w)"
-    return re.sub(pattern, lambda match: f"[${match[0]}]", text)
+    pattern = rf"(?<![\w/$])({'|'.join(map(re.escape, known))})(?!\w)"
+    return re.sub(pattern, lambda match: f"[${spelt[match[0]]}]", text)
+
+
+def _written(
+    sentence: str, escape: Callable[[str], str], marks: Sequence[Callable[[str], str]]
+) -> str:
+    """Write a sentence: text by `escape`, marks of each kind in the order of `_MARK`."""
+    sentence, written, end = unbroken(sentence), [], 0
+    for match in _MARK.finditer(sentence):
+        kind = next(i for i, text in enumerate(match.groups()) if text is not None)
+        written += [escape(sentence[end : match.start()]), marks[kind](match.groups()[kind])]
+        end = match.end()
+    return "".join([*written, escape(sentence[end:])])
+
+
+def _cite(mark: str) -> str:
+    return f"({'; '.join(map(short_citation, _keys(mark)))})"
+
+
+def _equations(write: Callable[[str], str]) -> Callable[[str], str]:
+    return lambda model: ", ".join(map(write, get_model(model).latex))
 
 
 def to_text(sentence: str) -> str:
     """Write a sentence as plain text."""
+    return _written(sentence, str, (_cite, plain, unit_plain, _equations(text), str, str))
 
-    def replaced(match: re.Match[str]) -> str:
-        keys, name, unit, model, code = match.groups()
-        if keys:
-            return f"({'; '.join(short_citation(key.strip(' @')) for key in keys.split(';'))})"
-        if unit:
-            return unit_plain(unit)
-        if model:
-            return ", ".join(map(text, get_model(model).latex))
-        return plain(name) if name else code
 
-    return _MARK.sub(replaced, unbroken(sentence))
+def to_html(sentence: str) -> Markup:
+    """Write a sentence for a page."""
+    return Markup(
+        _written(
+            sentence, lambda part: str(html_escape(part)),
+            (lambda mark: str(html_escape(_cite(mark))), symbol_html, unit_html, _equations(html),
+             lambda strong: f"<strong>{html_escape(strong)}</strong>",
+             lambda code: f"<code>{html_escape(code)}</code>"),
+        )
+    )  # fmt: skip
+
+
+def prose(text: str, names: Iterable[str]) -> Markup:
+    """Write a plain sentence for a page, the parameters in it as symbols."""
+    return to_html(with_symbols(text, names))
 
 
 def to_latex(sentence: str) -> str:
     r"""Write a sentence for LaTeX; citations are ``\cite`` with the keys of `references.bib`."""
-    written, end = [], 0
-    sentence = unbroken(sentence)
-    for match in _MARK.finditer(sentence):
-        keys, name, unit, model, code = match.groups()
-        before = escape(sentence[end : match.start()])
-        if keys:
-            before = before.rstrip(" ") + "~"
-            mark = f"\\cite{{{','.join(key.strip(' @') for key in keys.split(';'))}}}"
-        elif name:
-            mark = symbol(name)  # mathtext is a part of LaTeX
-        elif unit:
-            mark = latex_unit(unit)
-        elif model:
-            mark = ", ".join(get_model(model).latex)
-        else:
-            # Long names and hashes may break after a slash.
-            mark = f"\\texttt{{{escape(code).replace('/', '/' + chr(92) + 'allowbreak{}')}}}"
-        written += [before, mark]
-        end = match.end()
-    return "".join([*written, escape(sentence[end:])])
+    written = _written(
+        sentence, escape,
+        (lambda mark: f"\\cite{{{','.join(_keys(mark))}}}",
+         symbol,  # mathtext is a part of LaTeX
+         latex_unit, _equations(str), lambda strong: f"\\textbf{{{escape(strong)}}}",
+         # Long names and hashes may break after a slash.
+         lambda code: f"\\texttt{{{escape(code).replace('/', '/' + chr(92) + 'allowbreak{}')}}}"),
+    )  # fmt: skip
+    return written.replace(" \\cite", "~\\cite")
+
+
+def symbol_html(name: str) -> Markup:
+    """Return a parameter's symbol: ``K_lo`` as K with a subscript."""
+    stem, below = stem_and_subscript(name)
+    inside = Markup("<i>{}</i>").format(plain(stem))
+    return inside + Markup("<sub>{}</sub>").format(below) if below else inside
+
+
+def unit_html(unit: str) -> Markup:
+    """Return a unit with its powers raised; a dash where there is none."""
+    if unit in ("1", ""):
+        return Markup("&ndash;")
+    raised = re.sub(r"\^(-?)(\w+)", r"<sup>\1\2</sup>", str(html_escape(degrees(unit))))
+    return Markup(raised.replace("<sup>-", "<sup>&minus;"))

@@ -1,12 +1,19 @@
-"""Tables for print and for programs: estimates, posteriors, priors."""
+"""The tables of a report, each declared once: for the page, for LaTeX and for programs.
+
+To add one, write a function that returns it and list it in `TOPICS`. Cells, heads and captions are
+text with marks (`calib.report.publish.markup`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+import csv
+import io
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 from calib.inference.calibration import ParameterSummary
 from calib.inference.estimators import METHODS, method_name
-from calib.models import get_model
+from calib.report.document import Output
 from calib.report.numbers import (
     NOTHING,
     ascii_number,
@@ -17,25 +24,197 @@ from calib.report.numbers import (
     format_as_printed,
     format_like,
     format_number,
+    format_value,
     interval_text,
     last_place,
     skewed,
 )
-from calib.report.publish.markup import in_brackets, with_symbols
-from calib.report.publish.records import LatexTable, Output, Row
+from calib.report.publish.markup import to_latex, with_symbols
 from calib.report.reference import Figure
+
+TICK = "\N{CHECK MARK}"
+_LEVELS = ("50", "90", "95")
+
+type Row = Mapping[str, str]
+"""Cells by the head of their column."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows for people, in groups with a rule between them.
+
+    The label names its file; `columns` is LaTeX's column specification.
+    """
+
+    label: str
+    caption: str
+    columns: str
+    groups: Sequence[Sequence[Row]]
+
+    @property
+    def head(self) -> list[str]:
+        """Heads of the columns."""
+        return list(next(row for group in self.groups for row in group))
+
+    @property
+    def rows(self) -> list[list[str]]:
+        """The cells of all groups."""
+        return [list(row.values()) for group in self.groups for row in group]
+
+    def latex(self) -> str:
+        """Return it as a LaTeX float that needs the package booktabs."""
+        # Justified text in a narrow column has gaps; after \raggedright a row's end is spelt out.
+        ragged = "\\raggedright " if "p{" in self.columns else ""
+
+        def line(cells: Iterable[str]) -> str:
+            first, *others = map(to_latex, cells)
+            return f"    {' & '.join([first, *(ragged + c for c in others)])} \\tabularnewline"
+
+        groups = ["\n".join(line(row.values()) for row in group) for group in self.groups if group]
+        return "\n".join([
+            "% Needs \\usepackage{booktabs}; the references cited are in references.bib.",
+            "\\begin{table}", "  \\centering", "  \\footnotesize",
+            f"  \\caption{{{to_latex(self.caption)}}}",
+            f"  \\label{{tab:{self.label.replace('_', '-')}}}",
+            f"  \\begin{{tabular}}{{{self.columns}}}", "    \\toprule", line(self.head),
+            "    \\midrule", "\n    \\midrule\n".join(groups), "    \\bottomrule",
+            "  \\end{tabular}", "\\end{table}", "",
+        ])  # fmt: skip
+
+
+def write_csv(rows: Sequence[Row]) -> str:
+    """Return rows for programs as CSV (RFC 4180, but for line ends); numbers are in ASCII."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, rows[0], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def _named(name: str, unit: str) -> str:
+    """Return symbol and unit of a parameter."""
+    return f"[${name}]" + ("" if unit in ("1", "") else f" ([u:{unit}])")
+
+
+def _yes(value: bool) -> str:
+    return "yes" if value else "NO"
+
+
+def _number(value: float | None, digits: int = 3, form: str = "") -> str:
+    if value is None:
+        return NOTHING
+    return format(value, form) if form else format_number(value, digits)
+
+
+# The posterior
+
+
+def posterior_table(o: Output) -> Table:
+    """Return the posterior summary of an output: parameters that follow from others first."""
+    derived = [s for s in o.posterior if s.sd_ratio != s.sd_ratio]
+    sampled = [s for s in o.posterior if s.sd_ratio == s.sd_ratio]
+    below = " The parameters above the rule follow from the sampled ones below it."
+    return Table(
+        f"posterior_{o.key}",
+        f"{'' if o.converged else 'NOT CONVERGED, not to be used. '}Posterior of the parameters of "
+        f"{o.model_words} from {o.found['data']['n']} rows of {o.data_words}: mean ± standard "
+        "deviation (sd), or the median where the interval is lopsided or spans decades; 95 % "
+        "highest-density interval (HDI); effective sample sizes (ESS), R-hat [@Vehtari_2021], and "
+        f"the sd over that of the prior.{below if derived else ''}",
+        "lrrrrrr",
+        [[_posterior_row(s) for s in group] for group in (derived, sampled)],
+    )
+
+
+def _posterior_row(s: ParameterSummary) -> Row:
+    return {
+        "Parameter": _named(s.name, s.unit), "Posterior": centre_text(s),
+        "95 % HDI": interval_text(s), "ESS bulk": f"{s.ess_bulk:.0f}",
+        "ESS tail": f"{s.ess_tail:.0f}", "R-hat": f"{s.rhat:.3f}",
+        "sd/prior sd": format_number(s.sd_ratio, 2),
+    }  # fmt: skip
+
+
+def posterior_rows(o: Output) -> Iterator[Row]:
+    """Yield a row for every parameter."""
+    for s in o.posterior:
+        last, (low, high) = last_place(s.sd, s.mcse_mean), end_places(s)
+        yield {
+            "parameter": s.name, "unit": s.unit,
+            "mean": ascii_number(s.mean, last), "sd": ascii_number(s.sd, last),
+            "mcse_mean": ascii_text(format_number(s.mcse_mean, 2)),
+            "median": ascii_number(s.median, centre_place(s)),
+            "hdi95_lower": ascii_number(s.hdi_lower, low),
+            "hdi95_upper": ascii_number(s.hdi_upper, high),
+            "ess_bulk": f"{s.ess_bulk:.0f}", "ess_tail": f"{s.ess_tail:.0f}",
+            "rhat": f"{s.rhat:.4f}",
+            "posterior_sd_over_prior_sd": ascii_text(format_number(s.sd_ratio, 2)),
+            "converged": "yes" if o.converged else "no",
+        }  # fmt: skip
+
+
+def sensitivity_table(o: Output) -> Table:
+    """Return what each parameter owes to the prior and to the data."""
+    found, limits = o.found["prior_sensitivity"]["parameters"], o.found["prior_sensitivity"]
+    criteria = limits["criteria"]
+    unknown = ", ".join(f"[${name}]" for name, s in found.items() if not s["identified"])
+    said = f"Not identified by these data: {unknown}." if unknown else (
+        "Every parameter is identified by these data."
+    )  # fmt: skip
+    return Table(
+        f"sensitivity_{o.key}",
+        f"{said} A parameter is not identified if its contraction, 1 \N{MINUS SIGN} (posterior "
+        f"variance)/(prior variance), is below {criteria['contraction_at_least']:g}, or if it "
+        f"reacts to the prior (at least {criteria['power_scaling_threshold']:g}) and not to the "
+        "data (less). Reacts to: how far its posterior moves per doubling of the power of the "
+        "prior, or of the likelihood (cumulative Jensen-Shannon distance; Kallioinen et al. 2024, "
+        "doi:10.1007/s11222-023-10366-5).",
+        "lrrrl",
+        [[
+            {"Parameter": f"[${name}]", "Contraction": _number(s["contraction"], 2),
+             "Reacts to prior": _number(s["prior"], 2),
+             "Reacts to data": _number(s["likelihood"], 2),
+             "Identified by": s["reading"] if s["identified"] else f"[!{s['reading']}]"}
+            for name, s in found.items()
+        ]],
+    )  # fmt: skip
+
+
+# Point estimates
 
 _ALONE = {"B": "1/%", "C": "1", "D": "kN", "E": "1", "cost": "kN^2"}
 _QUALITY = {"cost": "Sum of squares", "rmse": "RMSE", "r_squared": "R²"}
 
+type _Estimate = tuple[str, str, str, float | None, Figure | None, str]
+"""Quantity, unit, method, value, printed figure, and where that is."""
 
-def _short(method: str) -> str:
-    return METHODS[method].short if method in METHODS else method
+
+def _together(o: Output) -> Iterator[_Estimate]:
+    """Yield the estimates from all rows together, and how well they fit."""
+    table, quality = o.reference.table(o.model.name), o.reference.quality(o.model.name)
+    shown, source = ({**table.estimates, **quality}, table.source) if table else ({}, "")
+    varying = {k: u for k, u in o.model.reported.items() if k in o.found["posterior"]}
+    for method, values in o.found["estimates"].items():
+        fit = o.found["fit"][method]
+        units = {"cost": fit["cost_unit"], "rmse": fit["rmse_unit"], "r_squared": "1"}
+        for name, unit in (varying | units).items():
+            value = (fit if name in _QUALITY else values)[name]
+            yield name, unit, method, value, shown.get(name), source
 
 
-def _varying(o: Output) -> dict[str, str]:
-    """Published parameters that were not held fixed, with their units."""
-    return {k: u for k, u in get_model(o.model).reported.items() if k in o.found["posterior"]}
+def _psi(pressure: str) -> float:
+    return float(pressure.partition(" ")[0])
+
+
+def _alone(o: Output) -> Iterator[tuple[str, str, list[_Estimate]]]:
+    """Yield each pressure and method, and the estimates from the rows of that pressure alone."""
+    for pressure, by_method in o.found["by_pressure"].items():
+        for method, values in by_method.items():
+            beside = o.reference.beside(method, _psi(pressure))
+            shown, place = (beside.figures, beside.place) if beside else ({}, "")
+            yield pressure, method, [
+                (k, u, method, values[k], shown.get(k), place) for k, u in _ALONE.items()
+            ]  # fmt: skip
 
 
 def _digits(value: float | None, printed: Figure | None) -> str:
@@ -44,118 +223,70 @@ def _digits(value: float | None, printed: Figure | None) -> str:
     return format_number(value, 4) if printed is None else format_as_printed(value, printed.text)
 
 
-type _Estimate = tuple[str, str, str, float | None, Figure | None, str]
-"""Quantity, unit, method, value, printed figure, and where that is."""
+def _ticked(value: float | None, printed: Figure | None) -> str:
+    same = printed is not None and value is not None and printed.agrees(value)
+    return _digits(value, printed) + (TICK if same else "")
 
 
-def _together(o: Output) -> Iterator[_Estimate]:
-    """Yield the estimates from all rows together, and how well they fit."""
-    table, quality = o.reference.table(o.model), o.reference.quality(o.model)
-    shown, source = ({**table.estimates, **quality}, table.source) if table else ({}, "")
-    for method, values in o.found["estimates"].items():
-        fit = o.found["fit"][method]
-        units = {"cost": fit["cost_unit"], "rmse": fit["rmse_unit"], "r_squared": "1"}
-        for name, unit in (_varying(o) | units).items():
-            value = (fit if name in _QUALITY else values)[name]
-            yield name, unit, method, value, shown.get(name), source
-
-
-def _alone(o: Output) -> Iterator[tuple[str, list[_Estimate]]]:
-    """Yield each pressure, and the estimates of each method from its rows alone."""
-    for pressure, by_method in o.found["by_pressure"].items():
-        for method, values in by_method.items():
-            beside = o.reference.beside(method, _psi(pressure))
-            shown, place = (beside.figures, beside.place) if beside else ({}, "")
-            yield pressure, [(k, u, method, values[k], shown.get(k), place)
-                             for k, u in _ALONE.items()]  # fmt: skip
-
-
-def _psi(pressure: str) -> float:
-    return float(pressure.partition(" ")[0])
-
-
-def estimates_csv(outputs: Sequence[Output]) -> list[Row]:
-    """Return every estimate of every output: all rows together, then each pressure alone."""
-    rows: list[Row] = []
-    for o in outputs:
-        found = [(o.model, "together", str(o.n_estimated), e) for e in _together(o)]
-        found += [("magic_formula", at, "", e) for at, estimates in _alone(o) for e in estimates]
-        for model, at, n, (name, unit, method, value, printed, source) in found:
-            row = {
-                "output": o.key, "model": model, "rows": at, "n_rows": n, "quantity": name,
-                "unit": unit, "method": method, "value": ascii_text(_digits(value, printed)),
-                "published": "", "published_in": "", "same_printed_digits": "",
-            }  # fmt: skip
-            if printed is not None and value is not None:
-                row |= {"published": printed.text, "published_in": source}
-                row["same_printed_digits"] = "yes" if printed.agrees(value) else "no"
-            rows.append(row)
-    return rows
-
-
-def estimates_latex(o: Output) -> LatexTable | None:
-    """Return the estimates of an output; None where no method gave one."""
+def estimates_table(o: Output) -> Table | None:
+    """Return the estimates beside published figures and the posterior; None if there are none."""
     methods = list(o.found["estimates"])
     if not methods:
         return None
-    table = o.reference.table(o.model)
-    posterior = {s.name: s for s in o.posterior}
-    cells: dict[str, dict[str, str]] = {}
+    short = {m: METHODS[m].short if m in METHODS else m for m in methods}
+    table, fit = o.reference.table(o.model.name), o.found["fit"]
+    rows: dict[str, dict[str, str]] = {}
     for name, unit, method, value, printed, source in _together(o):
-        row = cells.setdefault(name, {"Parameter": _name_cell(name, unit)})
+        named = _named(name, unit).replace(f"[${name}]", _QUALITY.get(name, f"[${name}]"))
+        row = rows.setdefault(name, {"Parameter": named})
         if table:
             row[source] = format_like(printed.value, printed.text) if printed else NOTHING
-        row[_short(method)] = _ticked(value, printed)
-    for name, row in cells.items():
-        row["Posterior"] = _posterior(posterior[name]) if name in posterior else NOTHING
-    data = o.found["data"]
-    rows = f"all {o.n_estimated}" if o.estimates_use_all_rows else str(o.n_estimated)
-    beside = f", beside its {table.source}" if table else ""
-    star = " An asterisk: equal to the source in every printed digit." if table else ""
-    return LatexTable(
-        label=f"estimates_{o.key}",
-        caption=(
-            f"Point estimates of the parameters of {o.model_words} from {rows} rows of "
-            f"{o.data_words}{beside}, and the posterior from {data['n']} rows (mean ± standard "
-            f"deviation, or median and 95 % highest-density interval). {_explained(methods)}{star}"
-        ),
-        columns=f"l{'r' * (len(methods) + 1 + bool(table))}",
-        groups=[
-            [row for name, row in cells.items() if (name in _QUALITY) is fit]
-            for fit in (False, True)
-        ],
-    )
+        row[short[method]] = _ticked(value, printed)
+    for name, text in (
+        ("Evaluations", {m: f"{fit[m]['evaluations']:,}" for m in methods}),
+        ("Stopped by its own rule", {m: _yes(fit[m]["converged"]) for m in methods}),
+    ):
+        beside = {table.source: NOTHING} if table else {}
+        rows[name] = {"Parameter": name, **beside, **{short[m]: t for m, t in text.items()}}
+    posterior = {s.name: s for s in o.posterior}
+    for name, row in rows.items():
+        s = posterior.get(name)
+        row["Posterior"] = NOTHING if s is None else centre_text(s) + (
+            f" ({interval_text(s)})" if skewed(s) else ""
+        )  # fmt: skip
+    said = [f"{short[m]}: {METHODS[m].title}" for m in methods if m in METHODS]
+    notes = [f"{method_name(m).capitalize()}: {fit[m]['note']}." for m in methods if fit[m]["note"]]
+    data, all_rows = o.found["data"], "all " if o.estimates_use_all_rows else ""
+    caption = [
+        f"Point estimates of the parameters of {o.model_words} from {all_rows}{o.n_estimated} rows "
+        f"of {o.data_words}{f', beside its {table.source}' if table else ''}, and the posterior "
+        f"from {data['n']} rows (mean ± standard deviation, or median and 95 % highest-density "
+        "interval).",
+        f"{'; '.join(said)}." if said else "",
+        f"A {TICK} marks what equals the source in every printed digit." if table else "",
+        *notes,
+        f"{table.source}: {table.note}." if table and table.note else "",
+    ]
+    parameters = [row for name, row in rows.items() if name in posterior]
+    return Table(
+        f"estimates_{o.key}", " ".join(filter(None, caption)).replace("..", "."),
+        f"l{'r' * (len(methods) + 1 + bool(table))}",
+        [parameters, [row for row in rows.values() if row not in parameters]],
+    )  # fmt: skip
 
 
-def _explained(methods: Sequence[str]) -> str:
-    words = [f"{METHODS[m].short}: {METHODS[m].title}" for m in methods if m in METHODS]
-    return f"{'; '.join(words)}." if words else ""
-
-
-def _posterior(s: ParameterSummary) -> str:
-    return f"{centre_text(s)} ({interval_text(s)})" if skewed(s) else centre_text(s)
-
-
-def _name_cell(name: str, unit: str) -> str:
-    return f"{_QUALITY.get(name) or f'[${name}]'}{in_brackets(unit)}"
-
-
-def _ticked(value: float | None, printed: Figure | None) -> str:
-    mark = "\N{CHECK MARK}" if printed and value is not None and printed.agrees(value) else ""
-    return _digits(value, printed) + mark
-
-
-def pressure_latex(o: Output) -> LatexTable | None:
+def pressure_table(o: Output) -> Table | None:
     """Return the Magic Formula at each pressure alone; None for other models."""
     groups: dict[str, list[Row]] = {}
-    names = [_name_cell(k, u) for k, u in _ALONE.items()]
+    names = [("Sum of squares" if k == "cost" else f"[${k}]") + (f" ([u:{u}])" if u != "1" else "")
+             for k, u in _ALONE.items()]  # fmt: skip
 
     def add(pressure: str, method: str, cells: Iterable[str]) -> None:
-        named = dict(zip(names, cells, strict=True))
-        groups.setdefault(pressure, []).append({"Pressure": pressure, "Method": method} | named)
+        row = {"Pressure": pressure, "Method": method} | dict(zip(names, cells, strict=True))
+        groups.setdefault(pressure, []).append(row)
 
-    for pressure, found in _alone(o):
-        add(pressure, method_name(found[0][2]), (_ticked(e[3], e[4]) for e in found))
+    for pressure, method, found in _alone(o):
+        add(pressure, method_name(method), (_ticked(e[3], e[4]) for e in found))
     for pressure in groups:
         for tables in o.reference.alone.values():
             if (table := tables.get(round(_psi(pressure)))) is not None:
@@ -164,108 +295,195 @@ def pressure_latex(o: Output) -> LatexTable | None:
                     (format_like(figure.value, figure.text) for figure in printed))  # fmt: skip
     if not groups:
         return None
-    return LatexTable(
-        label=f"estimates_by_pressure_{o.key}",
-        caption=(
-            f"The Magic Formula (Eqs 3\N{EN DASH}5 of the source [@He_2019]) at each inflation "
-            f"pressure alone, {o.data_words}."
-            + (" An asterisk: equal to the source's table of that method (least squares and "
-               "differential evolution: of the genetic algorithm) in every printed digit."
-               if o.label else "")
-        ),
-        columns="llrrrrr",
-        groups=list(groups.values()),
+    marks = (
+        f" A {TICK} marks what equals the source's table of that method (least squares and "
+        "differential evolution: of the genetic algorithm) in every printed digit."
+    )
+    return Table(
+        f"estimates_by_pressure_{o.key}",
+        "The Magic Formula (Eqs 3\N{EN DASH}5 of the source [@He_2019]) at each inflation pressure "
+        f"alone, {o.data_words}.{marks if o.label else ''}",
+        "llrrrrr", list(groups.values()),
     )  # fmt: skip
 
 
-def posterior_csv(outputs: Sequence[Output]) -> list[Row]:
-    """Return the posterior summaries of all outputs, one row for every parameter."""
-    return [_csv_row(s, o) for o in outputs for s in o.posterior]
+def estimates_rows(o: Output) -> Iterator[Row]:
+    """Yield every estimate: all rows together, then each pressure alone."""
+    found = [(o.model.name, "together", str(o.n_estimated), e) for e in _together(o)]
+    found += [("magic_formula", at, "", e) for at, _, estimates in _alone(o) for e in estimates]
+    for model, at, n, (name, unit, method, value, printed, source) in found:
+        same = printed is not None and value is not None
+        yield {
+            "model": model, "rows": at, "n_rows": n, "quantity": name, "unit": unit,
+            "method": method, "value": ascii_text(_digits(value, printed)),
+            "published": printed.text if printed and same else "",
+            "published_in": source if same else "",
+            "same_printed_digits": ""
+            if printed is None or value is None
+            else _yes(printed.agrees(value)).lower(),
+        }  # fmt: skip
 
 
-def _csv_row(s: ParameterSummary, o: Output) -> Row:
-    last = last_place(s.sd, s.mcse_mean)
-    low, high = end_places(s)
-    return {
-        "output": o.key,
-        "model": o.model,
-        "parameter": s.name,
-        "unit": s.unit,
-        "mean": ascii_number(s.mean, last),
-        "sd": ascii_number(s.sd, last),
-        "mcse_mean": ascii_text(format_number(s.mcse_mean, 2)),
-        "median": ascii_number(s.median, centre_place(s)),
-        "hdi95_lower": ascii_number(s.hdi_lower, low),
-        "hdi95_upper": ascii_number(s.hdi_upper, high),
-        "ess_bulk": f"{s.ess_bulk:.0f}",
-        "ess_tail": f"{s.ess_tail:.0f}",
-        "rhat": f"{s.rhat:.4f}",
-        "posterior_sd_over_prior_sd": ascii_text(format_number(s.sd_ratio, 2)),
-        "converged": "yes" if o.converged else "no",
-    }
+# Scores on rows that were not fitted
 
 
-def posterior_latex(o: Output) -> LatexTable:
-    """Return the posterior summary of an output."""
-    found = o.posterior
-    sampled = [s for s in found if s.sd_ratio == s.sd_ratio]
-    derived = [s for s in found if s.sd_ratio != s.sd_ratio]
-    below = ""
-    if derived:
-        below = " The parameters above the rule follow from the sampled ones below it."
-    warning = "" if o.converged else "NOT CONVERGED, not to be used. "
-    return LatexTable(
-        label=f"posterior_{o.key}",
-        caption=(
-            f"{warning}Posterior of the parameters of {o.model_words} from {o.found['data']['n']} "
-            f"rows of {o.data_words}: mean ± standard deviation (sd), or the median where the "
-            "interval is lopsided or spans decades; 95 % highest-density interval (HDI); effective "
-            "sample sizes (ESS), R-hat [@Vehtari_2021], and the sd over that of the "
-            f"prior.{below}"
-        ),
-        columns="lrrrrrr",
-        groups=[[_latex_row(s) for s in group] for group in (derived, sampled)],
+def _errors(o: Output) -> list[str]:
+    """Return RMSE and CRPS as `Output.axis` says, and the largest relative error in per cent."""
+    v, factor = o.found["validation"], o.axis().factor
+    wanted = (("rmse", factor, 3), ("crps", factor, 3), ("max_relative_error", 100.0, 2))
+    return [_number(None if v[k] is None else f * v[k], n) for k, f, n in wanted]
+
+
+def validation_table(found: Sequence[Output]) -> Table:
+    """Return the scores of every output."""
+    labels = sorted({o.label for o in found if o.label})
+    rows = []
+    for o in found:
+        v = o.found["validation"]
+        elpd = v.get("elpd")
+        rows.append({
+            "Output": f"{o.name} ({o.axis().unit})",
+            "Rows": f"held out: {o.held_out}" if o.held_out else "leave-one-out",
+            "n": str(v["n"]),
+            **dict(zip(("RMSE", "CRPS", "Error (%)"), _errors(o), strict=True)),
+            **{f"in {level} %": str(o.hits(level)) for level in _LEVELS},
+            "elpd": NOTHING if elpd is None else format_value(elpd, v["elpd_se"] or 0.0),
+        })  # fmt: skip
+    return Table(
+        "validation",
+        f"Predictions of rows that were not fitted{f' ({", ".join(labels)} data)' * bool(labels)}: "
+        "number of rows n, root mean square error of the predictive median (RMSE), mean continuous "
+        "ranked probability score (CRPS), largest relative error, rows in the central 50, 90 and "
+        "95 % predictive bands, and expected log predictive density (elpd) of leave-one-out "
+        "[@Vehtari_2017]. RMSE and CRPS in the unit of the output.",
+        "llrrrrrrrr",
+        [rows],
     )
 
 
-def _latex_row(s: ParameterSummary) -> Row:
-    return {
-        "Parameter": f"[${s.name}]{in_brackets(s.unit)}",
-        "Posterior": centre_text(s),
-        "95 % HDI": interval_text(s),
-        "ESS bulk": f"{s.ess_bulk:.0f}",
-        "ESS tail": f"{s.ess_tail:.0f}",
-        "R-hat": f"{s.rhat:.3f}",
-        "sd/prior sd": format_number(s.sd_ratio, 2),
+def validation_rows(o: Output) -> Iterator[Row]:
+    """Yield the scores."""
+    v = o.found["validation"]
+    rmse, crps, worst = map(ascii_text, _errors(o))
+    above = "n_relative_error_above_6_percent"
+    cells = {
+        "method": v["method"], "held_out": o.held_out, "n": str(v["n"]), "unit": o.axis().unit,
+        "rmse": rmse, "crps": crps, "max_relative_error_percent": worst, above: str(v[above]),
+    }  # fmt: skip
+    for level in _LEVELS:
+        cells[f"covered_{level}"] = str(o.hits(level))
+        low, high, *_ = v["coverage_interval"][level]
+        ends = {"": v["coverage"][level], "jeffreys95_lower_": low, "jeffreys95_upper_": high}
+        for end, share in ends.items():
+            cells[f"coverage_{level}_{end}percent"] = f"{100.0 * share:.0f}"
+    last = last_place(v["elpd_se"]) if v.get("elpd_se") else 0
+    for key in ("elpd", "elpd_se"):
+        cells[key] = "" if v.get(key) is None else ascii_number(v[key], last)
+    yield cells | {
+        "largest_pareto_k": ascii_text(_number(v.get("largest_pareto_k"), 2)),
+        "n_refitted": str(len(v.get("refitted", ()))),
     }
 
 
-def priors_csv(outputs: Sequence[Output]) -> list[Row]:
-    """Return the priors of all outputs."""
-    return [
-        {"output": o.key, "model": o.model, "parameter": name,
-         **{k: p[k] for k in ("unit", "distribution", "reason", "source")},
-         "file_sha256": o.task["priors"]["sha256"]}
-        for o in outputs for name, p in o.found["priors"].items()
-    ]  # fmt: skip
+# Convergence
 
 
-def priors_latex(o: Output) -> LatexTable:
-    """Return the priors of an output."""
-    file = o.task["priors"]
-    return LatexTable(
-        label=f"priors_{o.key}",
-        caption=(
-            f"Priors of the parameters of {o.model_words}, from `{file['source']}` (SHA-256 "
-            f"`{file['sha256'][:12]}`): normal(mean, sd), lognormal(median, sd of the logarithm), "
-            "on [lower, upper] where truncated."
-        ),
-        columns=r"lp{0.2\textwidth}p{0.36\textwidth}p{0.24\textwidth}",
-        groups=[[
-            {"Parameter": f"[${name}]{in_brackets(p['unit'])}",
-             "Distribution": p["distribution"].replace(" x ", " \N{MULTIPLICATION SIGN} "),
-             **{k.capitalize(): with_symbols(p[k], o.found["priors"])
-                for k in ("reason", "source")}}
-            for name, p in o.found["priors"].items()
+def _convergence(o: Output) -> dict[str, str]:
+    s = o.found["sampling"]
+    gate = s["gate"]
+    return {
+        **{k: str(s[k]) for k in ("ensembles", "walkers", "steps")},
+        "largest_rhat": _number(gate["largest_rhat"], form=".4f"),
+        "smallest_ess_bulk": _number(gate["smallest_ess_bulk"], form=".0f"),
+        "smallest_ess_tail": _number(gate["smallest_ess_tail"], form=".0f"),
+        "smallest_steps_over_tau": _number(gate["smallest_steps_over_tau"], 3),
+        "acceptance_percent": f"{100.0 * s['acceptance']:.0f}",
+        "density_evaluations": str(s["evaluations"]),
+    }
+
+
+def convergence_table(found: Sequence[Output], gate: Mapping[str, float]) -> Table:
+    """Return what the convergence gate saw, with its limits as in the manifest."""
+    heads = ("Ensembles", "Walkers", "Steps", "R-hat", "ESS bulk", "ESS tail",
+             "Steps/\N{GREEK SMALL LETTER TAU}", "Accepted (%)", "Evaluations")  # fmt: skip
+    return Table(
+        "convergence",
+        "Convergence of the posteriors: independently seeded ensembles, walkers in each, kept "
+        f"steps, largest rank-normalised R-hat [@Vehtari_2021] (at most {gate['rhat_max']:g} "
+        "passes), smallest bulk and tail effective sample size (at least "
+        f"{gate['ess_min']:g}), smallest length in autocorrelation times (at least "
+        f"{gate['taus_min']:g}), accepted proposals, evaluations of the density.",
+        "lrrrrrrrrrl",
+        [[
+            {"Output": o.name, **dict(zip(heads, _convergence(o).values(), strict=True)),
+             "Passed": _yes(o.converged)}
+            for o in found
         ]],
     )  # fmt: skip
+
+
+def convergence_rows(o: Output) -> Iterator[Row]:
+    """Yield what the convergence gate saw."""
+    evidence = ascii_text(_number(o.found["sampling"]["log_evidence"], 4))
+    seen = {name: ascii_text(text) for name, text in _convergence(o).items()}
+    yield {"passed": _yes(o.converged).lower(), **seen, "log_evidence": evidence}
+
+
+# Priors
+
+
+def priors_table(o: Output) -> Table:
+    """Return the priors of an output."""
+    file, priors = o.task["priors"], o.found["priors"]
+    return Table(
+        f"priors_{o.key}",
+        f"Priors of the parameters of {o.model_words}, from `{file['source']}` (SHA-256 "
+        f"`{file['sha256'][:12]}`): normal(mean, sd), lognormal(median, sd of the logarithm), "
+        "on [lower, upper] where truncated.",
+        r"lp{0.2\textwidth}p{0.36\textwidth}p{0.24\textwidth}",
+        [[
+            {"Parameter": _named(name, p["unit"]),
+             "Distribution": p["distribution"].replace(" x ", " \N{MULTIPLICATION SIGN} "),
+             **{k.capitalize(): with_symbols(p[k], priors) for k in ("reason", "source")}}
+            for name, p in priors.items()
+        ]],
+    )  # fmt: skip
+
+
+def priors_rows(o: Output) -> Iterator[Row]:
+    """Yield the priors."""
+    for name, p in o.found["priors"].items():
+        said = {k: p[k] for k in ("unit", "distribution", "reason", "source")}
+        yield {"parameter": name, **said, "file_sha256": o.task["priors"]["sha256"]}
+
+
+type _Each = Callable[[Output], Table | None]
+
+TOPICS: Mapping[str, tuple[Callable[[Output], Iterator[Row]], tuple[_Each, ...]]] = {
+    "posterior": (posterior_rows, (posterior_table,)),
+    "estimates": (estimates_rows, (estimates_table, pressure_table)),
+    "validation": (validation_rows, ()),
+    "convergence": (convergence_rows, ()),
+    "priors": (priors_rows, (priors_table,)),
+}
+"""By topic: the rows of an output for programs, and its tables for people."""
+
+
+def csv_tables(found: Sequence[Output]) -> dict[str, list[Row]]:
+    """Return the rows of every topic for programs; what reconstructed data are called, if any."""
+    labelled = any(o.label for o in found)
+    return {
+        topic: [
+            {"output": o.key, **({"data_label": o.label} if labelled else {}),
+             "model": o.model.name} | dict(row)
+            for o in found for row in rows(o)
+        ]
+        for topic, (rows, _) in TOPICS.items()
+    }  # fmt: skip
+
+
+def latex_tables(found: Sequence[Output], gate: Mapping[str, float]) -> list[Table]:
+    """Return all tables for people: of each output, and of all together."""
+    each = [table(o) for _, tables in TOPICS.values() for table in tables for o in found]
+    made = [*each, validation_table(found), convergence_table(found, gate)]
+    return [table for table in made if table is not None]

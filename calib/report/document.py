@@ -1,22 +1,31 @@
-"""`summary.json`: every number of a study, with its uncertainty, for machines."""
+"""The document of a study: its numbers as `summary.json` has them, and all views read them.
+
+Page, tables, methods and files for programs are functions of `Output`: what manifest and summary
+say of one output. A page shows a little more, which `page_facts` works out of the result.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
 
-from calib.inference.calibration import Calibration
+from calib.inference.calibration import Calibration, ParameterSummary
 from calib.inference.estimators import PointEstimate
 from calib.inference.noise import Noise
+from calib.models import Model, get_model
 from calib.models.base import Array
+from calib.report.labels import Axis, axis_of, units_of
 from calib.report.numbers import finite
+from calib.report.reference import Reference, reference_of
+from calib.report.rows import held_table, x_column
 from calib.report.study import OutputResult, Study
+from calib.report.study_tasks import HoldOut
 from calib.report.verdict import judge_evidence
 from calib.validation.comparison import NoisePreference
-from calib.validation.scores import CONTRACTION_MIN, SENSITIVITY_MIN, Scores
+from calib.validation.scores import CONTRACTION_MIN, SENSITIVITY_MIN, Scores, role
 
 SCHEMA = "calib/summary/1"
 
@@ -207,4 +216,139 @@ def _sampling(calibration: Calibration) -> dict[str, Any]:
             if not p.fixed
         },
         "log_posterior_at_mode": float(problem.log_prob(d.mode[None])[0]),
+    }
+
+
+@dataclass(frozen=True)
+class Output:
+    """One output that was worked out, as manifest and summary have it.
+
+    Parameters
+    ----------
+    key : str
+        Of `OUTPUTS`.
+    task, found : mapping
+        Its entries in manifest and summary.
+    facts : mapping
+        Those of `page_facts`, where there is a page.
+    """
+
+    key: str
+    task: Mapping[str, Any]
+    found: Mapping[str, Any]
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """In words."""
+        return self.key.replace("_", " ").capitalize()
+
+    @property
+    def model(self) -> Model:
+        """That was calibrated."""
+        return get_model(str(self.task["model"]))
+
+    @property
+    def model_words(self) -> str:
+        """The model by its title and its place in the source, with marks."""
+        model = self.model
+        source = f"the source [@{model.cited}]" if model.cited else model.source
+        numbers = model.numbers.replace("-", "\N{EN DASH}")
+        origin = f"{numbers} of {source}" if numbers and source else source
+        return f"\u201c{model.title}\u201d" + (f" ({origin})" if origin else "")
+
+    @property
+    def label(self) -> str:
+        """What the data are called; empty for measurements."""
+        return str(self.found["data"]["label"])
+
+    @property
+    def data_words(self) -> str:
+        """What to call the data."""
+        return f"{self.label} data" if self.label else "data"
+
+    @property
+    def reference(self) -> Reference:
+        """What was printed on these data."""
+        return reference_of(self.label)
+
+    def axis(self, column: str = "") -> Axis:
+        """Return how a column, by default the output, is shown: in the unit of the file."""
+        with units_of(self.task["data"].get("header", ())):
+            return axis_of(column or self.found["output"])
+
+    @property
+    def converged(self) -> bool:
+        """Whether the posterior passed the gate."""
+        return bool(self.found["sampling"]["converged"])
+
+    @property
+    def held_out(self) -> str:
+        """Which rows were held out, in words; empty where none were."""
+        held = self.task["held_out"]
+        if held is None or self.found["validation"]["method"] != "held_out":
+            return ""
+        return HoldOut(**held).words
+
+    @property
+    def estimates_use_all_rows(self) -> bool:
+        """Whether point estimates are of more rows than the posterior: the source's were."""
+        data = self.found["data"]
+        return self.model.estimates_all_rows and bool(data["n_all"] > data["n"])
+
+    @property
+    def n_estimated(self) -> int:
+        """Of how many rows the point estimates are."""
+        return int(self.found["data"]["n_all" if self.estimates_use_all_rows else "n"])
+
+    @property
+    def posterior(self) -> tuple[ParameterSummary, ...]:
+        """Summaries of all parameters; NaN for what JSON has no number for."""
+        names = [f.name for f in fields(ParameterSummary) if f.name != "name"]
+        read = []
+        for name, entry in self.found["posterior"].items():
+            known = {**entry, "sd_ratio": entry["posterior_to_prior_sd"]}
+            numbers: dict[str, Any] = {
+                n: float("nan") if known.get(n) is None else known[n] for n in names
+            }
+            read.append(ParameterSummary(name=name, **numbers))
+        return tuple(read)
+
+    def hits(self, level: str) -> int:
+        """Return how many rows that were not fitted the band of a level covers."""
+        v = self.found["validation"]
+        return round(float(v["coverage"][level]) * int(v["n"]))
+
+
+def outputs(manifest: Mapping[str, Any], summary: Mapping[str, Any]) -> list[Output]:
+    """Return the outputs that were worked out; those that failed are left out."""
+    return [
+        Output(key, manifest["tasks"][key], found)
+        for key, found in summary["models"].items()
+        if "error" not in found
+    ]
+
+
+def page_facts(result: OutputResult, emulator_fails: Sequence[str] = ()) -> dict[str, Any]:
+    """Return what a page shows of a result beyond the summary: verdict, roles, single rows."""
+    problem, v, held = result.calibration.problem, result.validation, held_table(result)
+    evidence = replace(result.evidence, emulator_fails=emulator_fails)
+    error = np.abs(v.scores.relative_error)
+    judged = np.isfinite(error)
+    worst = int(np.nanargmax(error)) if judged.any() else None
+    conditions = np.column_stack(list(problem.conditions.values()))
+    names = (*problem.conditions, problem.bound.model.output)
+    with units_of(result.task.table.header):
+        ranges = {n: axis_of(n).range_text(problem.table[n]) for n in names}
+    return {
+        "evidence": evidence,
+        "verdict": judge_evidence(evidence),
+        "roles": {name: role(result.calibration, name) for name in result.calibration.summary},
+        "judged": int(judged.sum()),
+        "worst": {} if worst is None else {c: v.table[c][worst] for c in problem.conditions},
+        "along": x_column(result),
+        "distinct": None if held is not None else np.unique(conditions, axis=0).shape[0],
+        "held": 0 if held is None else len(held),
+        "ranges": ranges,
+        "stored": result.calibration.draws.t.shape[1:3],
     }
