@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import calib.report.study as study_module
-from calib.batch.environment import sha256
+from calib.batch.environment import Environment, sha256
 from calib.data import read_table, table_from_arrays, write_table
 from calib.data.reader import label_of
 from calib.he2019 import embedded
@@ -21,7 +21,7 @@ from calib.he2019.published import PUBLISHED
 from calib.inference.prior_files import default_priors
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.document import summarise
-from calib.report.sections import work_out
+from calib.report.sections import Report, work_out
 from calib.report.study import Failure, OutputResult, Study
 from calib.report.study_tasks import Task, plan_tasks
 from calib.report.writer import build_manifest, file_hashes
@@ -231,7 +231,9 @@ def test_the_summary_is_strict_json(study: Study) -> None:
 def test_the_manifest_says_what_a_result_was_made_from(study: Study, tmp_path: Path) -> None:
     inputs = {key: {"data": {"file": f"data/{key}.csv"}} for key in study.results}
     settings = SamplerSettings(max_steps=1000)
-    found = build_manifest(study, settings, ["calib", "report"], inputs)
+    found = build_manifest(
+        Report(study), settings, ["calib", "report"], "", Environment.here(), inputs
+    )
     assert json.loads(json.dumps(found)) == found
     assert found["command"] == ["calib", "report"]
     assert found["seed"] == 2019
@@ -248,7 +250,9 @@ def test_the_manifest_says_what_a_result_was_made_from(study: Study, tmp_path: P
 
 def test_durations_are_in_the_manifest_alone(study: Study) -> None:
     inputs = {key: {} for key in study.results}
-    seconds = build_manifest(study, SamplerSettings(), [], inputs)["seconds"]
+    seconds = build_manifest(Report(study), SamplerSettings(), [], "", Environment.here(), inputs)[
+        "seconds"
+    ]
     assert seconds["study"] == study.seconds
     assert set(seconds) == {"study", *study.successes}
     assert seconds["rut_depth"]["sample"] > 0.0
