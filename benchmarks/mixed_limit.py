@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
-from math import log
 from pathlib import Path
 from unittest.mock import patch
 
@@ -24,7 +23,7 @@ from calib.gap.diagnose import diagnose
 from challenge.make import PAIR_FRACTION, TRIPLE_FRACTION, UNKNOWN_FRACTION
 
 EFFECTS = 14  # that are tested where pull and rut are measured
-NEVER = log(1e-9)
+NEVER = 1e-9
 SEED = 1
 
 
@@ -34,10 +33,10 @@ def priors() -> Mapping[str, object]:
     alone = 1.0 - pairs - TRIPLE_FRACTION["large"]
     a_pair, a_single = pairs / (EFFECTS * (EFFECTS - 1) / 2), alone / EFFECTS
     return {
-        "LN_PAIR_TO_SINGLE": log(a_pair / a_single),
-        "LN_PRIOR": {
-            "none": NEVER, "parameter_shift": NEVER, "unknown": log(UNKNOWN_FRACTION),
-            "single": log((1.0 - UNKNOWN_FRACTION) * alone),
+        "PAIR_TO_SINGLE": a_pair / a_single,
+        "PRIOR": {
+            "none": NEVER, "parameter_shift": NEVER, "unknown": UNKNOWN_FRACTION,
+            "single": (1.0 - UNKNOWN_FRACTION) * alone,
         },
     }  # fmt: skip
 

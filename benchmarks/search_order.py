@@ -16,6 +16,7 @@ import argparse
 from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
 
@@ -31,9 +32,9 @@ from calib.gap.ranking import rank
 
 # A search that gives up later, makes more sets of more others, and fits each from all of them.
 WIDER = {
-    "_N_PAIR_SEEDS": 99, "_N_SETS": 8, "_NEAR": 6.0, "_N_FITTED": 48, "_N_AGAIN": 99,
-    "_AGAIN": np.inf, "_BETTER": 0.3, "_HOPELESS": 25.0, "_SEARCHED": 12.0, "_BEHIND": 12.0,
-    "_BEHIND_RESIZED": 14.0,
+    "pair_seeds": 99, "sets_changed": 8, "near_best": 6.0, "fitted": 48, "fitted_again": 99,
+    "again": np.inf, "better": 0.3, "hopeless": 25.0, "searched": 12.0, "behind": 12.0,
+    "behind_resized": 14.0,
 }  # fmt: skip
 SEARCHES = ("another seed", "listed otherwise", "other pairs first", "several times as wide")
 
@@ -50,7 +51,7 @@ def found(folder: Path, how: str) -> Mapping[str, float]:
     elif how == "other pairs first":
         patches = patch.object(search, "_pair_seeds", lambda m, _: rng.permutation(m)[:4].tolist())
     elif how == "several times as wide":
-        patches = patch.multiple(search, **WIDER)
+        patches = patch.object(search, "SEARCH", replace(search.SEARCH, **WIDER))
     with patches:
         ranking = rank(campaigns(read_case(folder)), seed, effects={n: EFFECTS[n] for n in names})
     return inclusion_probability(ranking.probability)

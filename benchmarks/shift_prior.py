@@ -23,10 +23,11 @@ from calib.batch.tasks import completed
 from calib.batch.threads import one_thread
 from calib.gap.campaigns import OutputData, campaigns
 from calib.gap.case import read_case
+from calib.gap.constants import SHIFTS
 from calib.gap.discrepancy import alone_sd, coordinates
 from calib.gap.fit import Fit, fit
 from calib.gap.forward import Forward
-from calib.gap.hypotheses import SHIFTS, Hypothesis
+from calib.gap.hypotheses import Hypothesis
 from calib.gap.ranking import calibrate_lab
 from challenge.design import Tier
 from challenge.make import make_case

@@ -19,7 +19,6 @@ from calib.gap.diagnose import Diagnosis, diagnose
 from calib.gap.files import write_diagnosis
 
 INPUTS = "inputs.json"
-_SHOWN = 5
 
 
 def inputs_record(case: Case, seed: int, effects: Mapping[str, bytes] | None = None) -> bytes:
@@ -88,9 +87,12 @@ def case_hashes(folder: Path) -> dict[str, Any]:
         context = ["it cannot be read"]
     own = content.get("covariates")
     return {
-        "models": content.get("models"), "sha256": hashes, "context": context, "priors": priors,
+        "models": content.get("models"),
+        "sha256": hashes,
+        "context": context,
+        "priors": priors,
         "covariates": (_kinds(own) if isinstance(own, dict) else own) or None,
-    }  # fmt: skip
+    }
 
 
 def _kinds(covariates: Mapping[str, object]) -> dict[str, str]:
@@ -114,13 +116,14 @@ def check_resumable(cases: Sequence[Path], out: Path, seed: int) -> None:
         reason, names = next(iter(found.items()))
         raise CalibError(
             f"{len(names)} of the diagnoses that are there {reason}: {_listed(names)}",
-            where=str(out), expected="an empty folder, or earlier diagnoses of the same cases",
+            where=str(out),
+            expected="an empty folder, or earlier diagnoses of the same cases",
             hint="choose another --out, or delete this folder",
-        )  # fmt: skip
+        )
 
 
 def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")
+    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
 
 
 def _foreign(cases: Sequence[Path], out: Path, seed: int) -> Mapping[str, list[str]]:
@@ -163,9 +166,11 @@ def case_folders(folder: Path) -> list[Path]:
     found = sorted(p.parent for p in Path(folder).glob("*/case.toml"))
     if not found:
         raise CalibError(
-            "there are no cases", where=str(folder), expected="folders with a case.toml in them",
+            "there are no cases",
+            where=str(folder),
+            expected="folders with a case.toml in them",
             hint="make some with `calib challenge make`",
-        )  # fmt: skip
+        )
     return found
 
 
@@ -200,10 +205,16 @@ def diagnose_cases(
     """
     check_resumable(cases, out, seed)
     outcome = run_tasks(
-        partial(_diagnose, seed=seed), {case.name: case for case in cases}, out,
-        read=read_case, folders=True, workers=workers, scheduler=scheduler,
-        progress=progress, announce=announce,
-    )  # fmt: skip
+        partial(_diagnose, seed=seed),
+        {case.name: case for case in cases},
+        out,
+        read=read_case,
+        folders=True,
+        workers=workers,
+        scheduler=scheduler,
+        progress=progress,
+        announce=announce,
+    )
     return dict(outcome.failed)
 
 

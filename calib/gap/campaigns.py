@@ -17,6 +17,7 @@ from calib.data.quantities import OUTPUTS, QUANTITIES, columns_of, physical_role
 from calib.data.table import accepted_headers, renamed
 from calib.errors import CalibError
 from calib.gap.case import Case
+from calib.gap.constants import ASSUMED_LOAD_KN, MAX_RATIO, MIN_FIELD_ROWS
 from calib.gap.effects import Effect, View
 from calib.gap.noise import NoiseConditions, noise_conditions, noise_conditions_of_lab
 from calib.inference.priors import Priors
@@ -32,12 +33,22 @@ if TYPE_CHECKING:
 # What something may vary with by itself, where it is not just one physical role: the first of them
 # that is recorded and varies.
 _OVER = {
-    "water": ("water", "water_by_volume"), "pressure": ("pressure", "ground_pressure"),
+    "water": ("water", "water_by_volume"),
+    "pressure": ("pressure", "ground_pressure"),
     "low_pressure": ("pressure",),
-}  # fmt: skip
+}
 # Roles of which a discrepancy knows what they may do.
-_KNOWN = ("slip", "order", "speed", "passes", "load", "cone", "ground_pressure",
-          "water_by_volume", *_OVER)  # fmt: skip
+_KNOWN = (
+    "slip",
+    "order",
+    "speed",
+    "passes",
+    "load",
+    "cone",
+    "ground_pressure",
+    "water_by_volume",
+    *_OVER,
+)
 
 
 def columns_over(what: str) -> tuple[str, ...]:
@@ -52,7 +63,7 @@ def other_conditions(view: View) -> tuple[str, ...]:
     return tuple(dict.fromkeys(roles))
 
 
-class Covariates:
+class ScaledConditions:
     """Covariates of a pair of campaigns on a scale of -1..1."""
 
     def __init__(self, data: Campaigns) -> None:
@@ -96,13 +107,7 @@ class Covariates:
         return np.clip((values - mid) / half, -1.5, 1.5)
 
 
-# Physical roles of the outputs whose simulators may be bent over their conditions.
-_BENT = ("density",)
-# Axes of an emulator's error below so many times what it neglects itself are left out.
-_FEWER = 3.0
-
-
-class Simulated:
+class CaseSimulator:
     """One output's simulator, with its inadequacy.
 
     Parameters
@@ -165,10 +170,10 @@ class Simulated:
         """
         prepared = (found for known, found in self._known if known is conditions)
         rows, bends = next(prepared, None) or (None, self._bends(conditions))
-        location = self._bound.mean_response(self._priors.to_natural(t), conditions, rows)
+        mean = self._bound.mean_response(self._priors.to_natural(t), conditions, rows)
         for column, bend in enumerate(bends):
-            location = location + misfit[:, column : column + 1] * bend
-        return location
+            mean = mean + misfit[:, column : column + 1] * bend
+        return mean
 
     def predict_beyond(self, t: Array, misfit: Array, conditions: Mapping[str, Array]) -> Array:
         """Predict where an effect may have taken the pressure beyond those of both campaigns.
@@ -187,15 +192,15 @@ class Simulated:
         beyond = (pressure - inside) / (high - low)
         if not beyond.any():
             return self.predict(t, misfit, conditions)
-        location = self.predict(t, misfit, {**conditions, column: inside})
+        mean = self.predict(t, misfit, {**conditions, column: inside})
         # Both ends in one call, each a pressure of all vectors, for the rows that any takes beyond.
         rows = np.flatnonzero(np.atleast_2d(beyond).any(axis=0))
         twice = np.concatenate([rows, rows])
         ends = {name: v[..., twice] for name, v in conditions.items()}
         ends[column] = np.repeat([low, high], rows.size)
         at_low, at_high = np.split(self.predict(t, misfit, ends), 2, axis=1)
-        location[:, rows] += (at_high - at_low) * beyond[..., rows]
-        return location
+        mean[:, rows] += (at_high - at_low) * beyond[..., rows]
+        return mean
 
     def _error_of(self, conditions: Mapping[str, Array]) -> Array:
         """What the coefficients of the error make of an emulator's curves, shape (j, n_errors)."""
@@ -206,7 +211,7 @@ class Simulated:
         at = at[np.isfinite(at).all(axis=1)]
         _, size, axes = np.linalg.svd(at, full_matrices=False)
         # What stays below is less than is ever looked into, of which each axis has its cost.
-        kept = size > _FEWER * self._emulator.negligible * np.sqrt(max(len(at), 1))
+        kept = size > 3.0 * self._emulator.negligible * np.sqrt(max(len(at), 1))
         return np.asarray(root[:, None] * axes[kept].T)
 
     def _bends(self, conditions: Mapping[str, Array]) -> list[Array]:
@@ -235,7 +240,7 @@ def _even(column: str, values: Array) -> Array:
 
 def _misfit_ranges(o: OutputData) -> tuple[tuple[str, float, float], ...]:
     """Conditions over which a simulator may be bent, with middle and half range in the lab."""
-    if o.role not in _BENT:
+    if o.role != "density":
         return ()
     found = []
     for name, values in o.problem.conditions.items():
@@ -244,13 +249,6 @@ def _misfit_ranges(o: OutputData) -> tuple[tuple[str, float, float], ...]:
         if half > 1e-9 * max(1.0, float(np.abs(values).max())):
             found.append((name, 0.5 * float(values.max() + values.min()), half))
     return tuple(found)
-
-
-# Fewer field rows cannot tell a gap from noise; a larger ratio is a wrong unit.
-MIN_FIELD_ROWS = 5
-MAX_RATIO = 100.0
-# What effects take for the load where none is recorded, as the shipped priors do.
-_LOAD_KN = 5.0
 
 
 @dataclass(frozen=True)
@@ -307,18 +305,18 @@ class Campaigns:
         return tuple(o.name for o in self.outputs if o.role == role)
 
     @cached_property
-    def simulated(self) -> dict[str, Simulated]:
+    def simulated(self) -> dict[str, CaseSimulator]:
         """Every output's simulator at the rows of both campaigns."""
         tables = (self.case.lab, self.case.field)
         # Where there is none no simulator asks for their range.
         recorded = np.concatenate([_recorded(t, "pressure", np.zeros(1)) for t in tables])
         pressures = float(recorded.min()), float(recorded.max())
-        return {o.name: Simulated(o, self.view, pressures) for o in self.outputs}
+        return {o.name: CaseSimulator(o, self.view, pressures) for o in self.outputs}
 
     @cached_property
-    def covariates(self) -> Covariates:
+    def covariates(self) -> ScaledConditions:
         """Conditions scaled to the range of both campaigns."""
-        return Covariates(self)
+        return ScaledConditions(self)
 
     @cached_property
     def forms(self) -> dict[Effect, tuple[Array, list[float]]]:
@@ -371,10 +369,12 @@ def campaigns(case: Case) -> Campaigns:
     lab, field = case.lab, case.field
     if identical_rows(lab, field) == len(field):
         raise CalibError(
-            "every field row is a row of the calibration, value for value", where=field.source,
-            expected="measurements of another campaign", hint="name the field's own file",
-        )  # fmt: skip
-    load = _recorded(lab, "load", _recorded(field, "load", np.array([_LOAD_KN])))
+            "every field row is a row of the calibration, value for value",
+            where=field.source,
+            expected="measurements of another campaign",
+            hint="name the field's own file",
+        )
+    load = _recorded(lab, "load", _recorded(field, "load", np.array([ASSUMED_LOAD_KN])))
     _check_load(lab, field)
     order = _recorded(field, "order", np.array([0.0, 1.0]))
     view = View(
@@ -397,14 +397,14 @@ def _check_load(lab: Table, field: Table) -> None:
     if not pulls or any(c in t for t in (lab, field) for c in columns_of("load")):
         return
     largest = float(np.nanmax(np.abs(np.concatenate(pulls))))
-    if not fits_load(largest, _LOAD_KN):
+    if not fits_load(largest, ASSUMED_LOAD_KN):
         raise CalibError(
-            f"there is no column normal_load_kn; a load of {_LOAD_KN:g} kN was assumed, but the "
-            f"largest pull is {plain_number(largest)} kN",
+            f"there is no column normal_load_kn; a load of {ASSUMED_LOAD_KN:g} kN was assumed, but "
+            f"the largest pull is {plain_number(largest)} kN",
             where=f"{lab.source}, {field.source}",
             expected=", ".join(accepted_headers(QUANTITIES["normal_load_kn"])),
             hint="add the column normal_load_kn to the calibration or the field",
-        )  # fmt: skip
+        )
 
 
 def _output(case: Case, name: str, model: str) -> OutputData:
@@ -412,9 +412,11 @@ def _output(case: Case, name: str, model: str) -> OutputData:
     if get_model(model).output != column:
         able = [m.name for m in MODELS.values() if m.output == column]
         raise CalibError(
-            f"the model {model} does not predict {name}", where=f"[models] of {case.name}",
-            expected=", ".join(able), hint="name a model of this output in case.toml",
-        )  # fmt: skip
+            f"the model {model} does not predict {name}",
+            where=f"[models] of {case.name}",
+            expected=", ".join(able),
+            hint="name a model of this output in case.toml",
+        )
     for table in (case.lab, case.field):
         if column not in table or not np.isfinite(table[column]).any():
             raise CalibError(
@@ -422,7 +424,7 @@ def _output(case: Case, name: str, model: str) -> OutputData:
                 where=table.source,
                 hint=f"{renamed(table.ignored, [column])}add the column, or take the model out of "
                 "case.toml",
-            )  # fmt: skip
+            )
         table.must_have(*get_model(model).conditions)
     lab = case.lab.take(np.isfinite(case.lab[column]))
     problem = build_problem(model, lab, case.priors.get(name))

@@ -21,11 +21,12 @@ from calib.data.quantities import OUTPUTS, role_of
 from calib.errors import CalibError
 from calib.gap.campaigns import Campaigns, campaigns
 from calib.gap.case import cells, read_case, with_declared
+from calib.gap.constants import NAMED, SMALLEST_GAP, SURPRISE, WORTH_SAYING
 from calib.gap.discrepancy import ShiftMap
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.fit import Fit
 from calib.gap.forward import Forward
-from calib.gap.hypotheses import Hypothesis, effect_priors, with_own
+from calib.gap.hypotheses import Hypothesis, effect_priors, with_case_effects
 from calib.gap.mixture import Mixture, Truth
 from calib.gap.noise import Noise
 from calib.inference.priors import Priors
@@ -33,14 +34,6 @@ from calib.models.base import Array
 from calib.validation.prediction import echoed, outside
 
 SCHEMA = "calib/corrected/5"
-# How far a loaded model may depart from what it said when saved, in noise sds.
-_SAME = 1e-4
-
-
-# A cause so probable is spoken of.
-_LIKELY = 0.5
-# What depends on the order of the runs less probably than this is not spoken of.
-_WORTH_A_WORD = 0.05
 
 
 class Corrected:
@@ -69,7 +62,7 @@ class Corrected:
             for effect in fit.forward.hypothesis.effects:
                 if effect.instrument:
                     probability[effect.name] = probability.get(effect.name, 0.0) + p
-        return [name for name, p in probability.items() if p >= _LIKELY]
+        return [name for name, p in probability.items() if p >= NAMED]
 
     @property
     def over_runs(self) -> bool:
@@ -79,7 +72,7 @@ class Corrected:
             h = fit.forward.hypothesis
             over = {c for effect in h.effects for c in effect.covariates}
             probability += p * bool({"order"} & {*over, h.smooth_over, h.onset_over})
-        return probability >= _WORTH_A_WORD
+        return probability >= WORTH_SAYING
 
     @property
     def causes(self) -> tuple[str, ...]:
@@ -205,15 +198,17 @@ def load_corrected(folder: Path, effects: Mapping[str, Effect] = EFFECTS) -> Cor
             raise ValueError
         data = campaigns(read_case(Path(folder) / "case"))
         lab_mode = {name: np.array(t) for name, t in content["lab_mode"].items()}
-        known = with_own(data, effects)
+        known = with_case_effects(data, effects)
         priors = cache(lambda name: effect_priors(data, known[name]))
         fits = tuple(_load_fit(data, f, known, priors, lab_mode) for f in content["fits"])
         probability = tuple(float(f["probability"]) for f in content["fits"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise CalibError(
-            f"there is no readable corrected model ({type(error).__name__})", where=str(path),
-            expected="a folder written by `calib diagnose`", hint="run the diagnosis again",
-        ) from None  # fmt: skip
+            f"there is no readable corrected model ({type(error).__name__})",
+            where=str(path),
+            expected="a folder written by `calib diagnose`",
+            hint="run the diagnosis again",
+        ) from None
     return Corrected(Mixture(data, fits, probability, int(content["seed"])), lab_mode)
 
 
@@ -233,12 +228,17 @@ def _load_fit(
             "--models FILE if it registers the effect, else --effects FILE",
         )
     hypothesis = Hypothesis(
-        document["name"], tuple(effects[name] for name in document["effects"]),
+        document["name"],
+        tuple(effects[name] for name in document["effects"]),
         tuple(map(priors, document["effects"])),
-        document["shift"], document["shift_as"], document["smooth"],
-        tuple(document["smooth_outputs"]), document["smooth_over"], document["smooth_decay"],
+        document["shift"],
+        document["shift_as"],
+        document["smooth"],
+        tuple(document["smooth_outputs"]),
+        document["smooth_over"],
+        document["smooth_decay"],
         document["onset_over"],
-    )  # fmt: skip
+    )
     noise = {o: Noise(n["sigma"], n["rho"], n["kappa"]) for o, n in document["noise"].items()}
     # What the coordinates of a shift mean is the file's, whatever the priors shipped now say.
     shift = _load_shift(document["shift_map"])
@@ -253,7 +253,7 @@ def _load_fit(
     fit = Fit(forward, psi, covariance, noise, 0.0, 0.0, {}, sample)
     for o, values in _field(fit).items():
         said = np.array(document["field"][o])
-        if not np.allclose(values, said, rtol=0.0, atol=_SAME * sigma[o], equal_nan=True):
+        if not np.allclose(values, said, rtol=0.0, atol=1e-4 * sigma[o], equal_nan=True):
             raise CalibError(
                 f"the hypothesis {document['name']} no longer predicts the {o} that it was saved "
                 "with: its effects, their priors or a model have changed since",
@@ -330,9 +330,11 @@ def predict_columns(
     missing = [n for n in needed if n not in table and n not in (*OUTPUTS.values(), order)]
     if missing:
         raise CalibError(
-            f"the corrected model needs {', '.join(missing)}", where=table.source,
-            expected="the conditions and covariates of the field campaign", hint="add the columns",
-        )  # fmt: skip
+            f"the corrected model needs {', '.join(missing)}",
+            where=table.source,
+            expected="the conditions and covariates of the field campaign",
+            hint="add the columns",
+        )
     conditions = dict(table.columns)
     if order is not None and order not in conditions:
         # A drift is predicted as it stood at the end of the campaign.
@@ -342,19 +344,12 @@ def predict_columns(
     for name, p in predict_new(truth, corrected.calibrated(conditions)).items():
         column = OUTPUTS[name]
         columns |= {
-            f"{column}_before": p.before, f"{column}_after": p.after,
-            f"{column}_after_lower": p.lower, f"{column}_after_upper": p.upper,
-        }  # fmt: skip
+            f"{column}_before": p.before,
+            f"{column}_after": p.after,
+            f"{column}_after_lower": p.lower,
+            f"{column}_after_upper": p.upper,
+        }
     return columns
-
-
-# A gap smaller than this part of the noise (rms) is not one that could shrink.
-_SMALLEST = 0.5
-# What is left of a gap may exceed its median by more than the formulas say, for nature acts by none
-# of them: of 838 outputs of the challenge's seeds 314159 and 173205, 12 % shrank by less than the
-# lower end of 90 % intervals. With the logarithm of what is left so much farther from its median it
-# is 7 %, and the intervals hold 90 %.
-_SURPRISE = 1.25
 
 
 @dataclass(frozen=True)
@@ -429,7 +424,7 @@ def _shrink_of(truth: Truth, before: Array, after: Array, name: str) -> Shrink |
     values, simulator, before, after = (a[..., known] for a in (values, simulator, before, after))
     floor = np.sqrt(np.square(truth.noise[name][:, known]).mean(axis=1))
     gap = np.sqrt(np.square(values - simulator).mean(axis=1))
-    if float(truth.weight @ (gap > _SMALLEST * floor)) < 0.5:
+    if float(truth.weight @ (gap > SMALLEST_GAP * floor)) < 0.5:
         return None
     before_error = np.sqrt(np.square(values - before).mean(axis=1))
     after_error = np.sqrt(np.square(values - after).mean(axis=1))
@@ -440,7 +435,7 @@ def _shrink_of(truth: Truth, before: Array, after: Array, name: str) -> Shrink |
 
     low, median, high = (quantile(fraction, q) for q in (0.05, 0.5, 0.95))
     left = max(1.0 - median, 1e-12)
-    low = 1.0 - left * (max(1.0 - low, left) / left) ** _SURPRISE
+    low = 1.0 - left * (max(1.0 - low, left) / left) ** SURPRISE
     errors = quantile(before_error, 0.5), quantile(after_error, 0.5)
     # The errors' own ratio, so that the three numbers agree where people read them together.
     stated = 1.0 - errors[1] / max(errors[0], 1e-12)

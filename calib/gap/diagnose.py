@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from calib.batch.pool import HERE
 from calib.batch.threads import one_thread
 from calib.data.quantities import OUTPUTS, columns_of, role_of
-from calib.gap.campaigns import MIN_FIELD_ROWS, Campaigns, campaigns
+from calib.gap.campaigns import Campaigns, campaigns
 from calib.gap.case import Case, Context, new_values, read_case
+from calib.gap.constants import FOLD_DRAWS, FOLDS, MIN_FIELD_ROWS, MOST_ROUNDS, NAMED, WORTH_SAYING
 from calib.gap.corrected import (
     Corrected,
     NewPrediction,
@@ -26,8 +27,8 @@ from calib.gap.corrected import (
 from calib.gap.effects import EFFECTS, Effect, View
 from calib.gap.effects.user import check_effects
 from calib.gap.fit import Fit
-from calib.gap.hypotheses import inseparable, singles, with_own
-from calib.gap.identifiability import Isolability, NextMeasurement, next_measurements
+from calib.gap.hypotheses import inseparable, singles, unusual_sizes, with_case_effects
+from calib.gap.identifiability import Identifiability, NextMeasurement, next_measurements
 from calib.gap.mixture import (
     UNLISTED,
     Inclusion,
@@ -44,25 +45,10 @@ from calib.gap.mixture import (
 from calib.gap.noise import noise_conditions
 from calib.gap.plausibility import doubts, oddities
 from calib.gap.ranking import Lab, Ranking, calibrate_lab, rank
-from calib.gap.screening import (
-    MOST_ROUNDS,
-    left_over,
-    screen,
-    without_field_outliers,
-    without_outputs,
-)
+from calib.gap.screening import left_over, screen, without_field_outliers, without_outputs
 from calib.inference.random import generator
 from calib.models.base import Array
 from calib.validation.residuals import Remark
-
-# A single hypothesis is named when it is at least this probable.
-NAMED = 0.5
-# A cause that is less probable needs no caveat.
-_WORTH_SAYING = 0.05
-# Parts the field rows are left out in, where there are no other conditions to judge by.
-_FOLDS = 5
-# Effective draws in each: they weigh predictions, in which an error of 0.03 nats is not seen.
-_OF_A_FOLD = 300
 
 
 @dataclass(frozen=True, repr=False)
@@ -176,12 +162,12 @@ def diagnose_once(case: Case, seed: int, effects: Mapping[str, Effect] = EFFECTS
     before = corrected.calibrated(target.conditions)
     far = shrink(data, at_target, before, at_target.means)
     causes = inclusion(mixed, ranking)
-    known = with_own(data, effects)
+    known = with_case_effects(data, effects)
     remarks = doubts(data, ranking)
     said += [
         *_beyond(corrected, before),
         *_confounded(data, causes, known),
-        *case.context.unusual(singles(data, _sized(case.context, known, ranking))),
+        *unusual_sizes(singles(data, _sized(case.context, known, ranking)), case.context),
     ]
     return Diagnosis(
         data,
@@ -278,7 +264,7 @@ def _confounded(data: Campaigns, causes: Inclusion, effects: Mapping[str, Effect
         "depends on it cannot be separated from anything else that changed between them"
         for name, effect in effects.items()
         if name in causes.causes
-        and (causes.causes[name].probability >= _WORTH_SAYING or own & set(effect.covariates))
+        and (causes.causes[name].probability >= WORTH_SAYING or own & set(effect.covariates))
         and inseparable(data, effect)
     ]
 
@@ -299,7 +285,7 @@ def _left_out(found: Diagnosis, effects: Mapping[str, Effect], pool: Executor) -
     Without other conditions to predict, this is how far the correction carries beyond the rows it
     was found on. With too few rows to leave some out, the rows' own predictions stand.
     """
-    data, truth, seed, design = found.data, found.truth, found.seed, found.ranking.isolability
+    data, truth, seed, design = found.data, found.truth, found.seed, found.ranking.identifiability
     folds = field_parts(data, seed)
     if not folds:
         return truth.means
@@ -316,18 +302,23 @@ def _left_out(found: Diagnosis, effects: Mapping[str, Effect], pool: Executor) -
 def field_parts(data: Campaigns, seed: int) -> list[NDArray[np.int64]]:
     """Return the field rows in the parts that are left out in turn; none if too few would stay."""
     order = generator(seed, "gap", "folds").permutation(len(data.case.field))
-    folds = [order[fold::_FOLDS] for fold in range(_FOLDS)]
+    folds = [order[fold::FOLDS] for fold in range(FOLDS)]
     left = min(np.setdiff1d(o.rows, rows).size for o in data.outputs for rows in folds)
     return folds if left >= MIN_FIELD_ROWS else []
 
 
 @one_thread()
 def _unseen(
-    case: Case, view: View, seed: int, effects: Mapping[str, Effect], lab: Lab, design: Isolability
+    case: Case,
+    view: View,
+    seed: int,
+    effects: Mapping[str, Effect],
+    lab: Lab,
+    design: Identifiability,
 ) -> dict[str, Array]:
     """Predict all rows of a field campaign from those that a case still has."""
     part = campaigns(case)
-    ranking = rank(part, seed, effects=effects, lab=lab, design=design, plenty=_OF_A_FOLD)
+    ranking = rank(part, seed, effects=effects, lab=lab, design=design, plenty=FOLD_DRAWS)
     return mixture(part, ranking, seed).at(view).means
 
 

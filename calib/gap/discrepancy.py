@@ -13,6 +13,7 @@ from scipy.special import expit
 
 from calib.errors import CalibError
 from calib.gap.campaigns import Campaigns, OutputData, other_conditions
+from calib.gap.constants import ONSET_WIDTH, RADIUS_ERROR, RIPPLES, SHIFT_DIFFERENCE
 from calib.gap.effects import View
 from calib.gap.effects.base import each
 from calib.gap.hypotheses import SETTINGS, Hypothesis, ShiftAs
@@ -20,10 +21,8 @@ from calib.inference.prior_files import default_priors
 from calib.inference.sampling.mode import prior_widths
 from calib.models.base import Array
 
-# Shifts of how a parameter varies with pressure, slip or water, relative to those of its value.
-DIFFERENCE = 0.2
 # Another zero of slip: unit of the relative error of the rolling radius.
-ZERO_OF_SLIP, RADIUS_ERROR = "slip_zero", 0.03
+ZERO_OF_SLIP = "slip_zero"
 # What water does to the strength of a soil: its prior spans all soils there are, of which those of
 # two campaigns with one density relation are near neighbours.
 _OF_WATER = ("C2", "C3")
@@ -81,14 +80,17 @@ def another_soil() -> dict[str, tuple[Array, float]]:
         file = _File.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
     except (OSError, tomllib.TOMLDecodeError, ValidationError) as error:
         raise CalibError(
-            f"the prior of parameter shifts cannot be read ({error})", where=str(path),
+            f"the prior of parameter shifts cannot be read ({error})",
+            where=str(path),
             hint="install the package again",
-        ) from None  # fmt: skip
+        ) from None
     if any(len(row.ways) != len(file.ways) for row in file.parameters.values()):
         raise CalibError(
-            "a parameter has not as many loadings as there are ways", where=str(path),
-            expected=f"{len(file.ways)} numbers each", hint="correct it",
-        )  # fmt: skip
+            "a parameter has not as many loadings as there are ways",
+            where=str(path),
+            expected=f"{len(file.ways)} numbers each",
+            hint="correct it",
+        )
     return {name: (np.array(row.ways), row.own) for name, row in file.parameters.items()}
 
 
@@ -122,7 +124,7 @@ def coordinates(outputs: Sequence[OutputData]) -> list[tuple[str, str]]:
 def alone_sd(quantity: str) -> float:
     """Prior sd of a quantity that shifts by itself, in its parameter's prior sds."""
     lesser = quantity.endswith(("_bend", "_difference")) or quantity in ("n1", *_OF_WATER)
-    return DIFFERENCE if lesser else 1.0
+    return SHIFT_DIFFERENCE if lesser else 1.0
 
 
 def shift_map(outputs: Sequence[OutputData], shift_as: ShiftAs) -> tuple[ShiftMap, list[float]]:
@@ -192,9 +194,6 @@ def _together(kinds: Sequence[str], alone: Array) -> Array:
 
 # Where a discrepancy may set in, and how sharply, on a covariate scaled to -1..1.
 THRESHOLDS = (-0.85, 0.9)
-_ONSET_WIDTH = 0.06
-# Most waves over the range of slips that a ripple may have.
-_WAVES = 12
 
 
 # Basis (n, m) and the sds of its coefficients (m,), by what they depend on.
@@ -260,12 +259,12 @@ class Discrepancy:
         part of the output's level instead.
         """
         u = self.onset_covariate(view, output)
-        beyond = (u - threshold[:, None]) / _ONSET_WIDTH
+        beyond = (u - threshold[:, None]) / ONSET_WIDTH
         step = expit(beyond)
         if self.hypothesis.onset_over == "low_pressure":
             # An underinflated tyre may lose a part of the pull, and more of it the more it pulls.
             return step, step * self._known(self._level(view, output))
-        shapes = step, _ONSET_WIDTH * np.logaddexp(0.0, beyond)
+        shapes = step, ONSET_WIDTH * np.logaddexp(0.0, beyond)
         return (*shapes, np.ones_like(step)) if self.hypothesis.onset_over == "slip" else shapes
 
     def onset_covariate(self, view: View, output: str) -> Array:
@@ -339,10 +338,10 @@ class Discrepancy:
         return self.covariates.over(view, over), min(values - 1, most)
 
     def _ripples(self, view: View) -> list[tuple[Array, float]]:
-        """Up to `_WAVES` waves over the slips, none more probable than another, of rms 1 in all."""
+        """Waves over the slips, none more probable than another, of rms 1 in all."""
         slip = self.covariates.over(view, "slip")
-        each = (2 * _WAVES) ** -0.5
-        return [(basis, each) for basis, _ in self._cosines(slip, 2 * _WAVES, 1.0)]
+        each = (2 * RIPPLES) ** -0.5
+        return [(basis, each) for basis, _ in self._cosines(slip, 2 * RIPPLES, 1.0)]
 
     def _cosines(self, u: Array | None, most: int, scale: float) -> list[tuple[Array, float]]:
         """Cosines of a covariate scaled to -1..1, and the sds of their coefficients."""

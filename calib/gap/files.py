@@ -101,7 +101,7 @@ def document(found: Diagnosis) -> dict[str, Any]:
         "track_record": _track_record(ranking.probability[ranking.order[0]]),
         "inclusion": {name: _included(c) for name, c in found.inclusion.causes.items()},
         "remainder": {
-            **_included(found.inclusion.remainder),
+            **_included(found.inclusion.residual_discrepancy),
             "where": [
                 {"output": r.output, "conditions": _ends(found, r)} for r in found.inclusion.where
             ],
@@ -245,10 +245,6 @@ def write_diagnosis(found: Diagnosis, folder: Path) -> None:
     write_table(folder / "fresh_prediction.csv", columns)
 
 
-# Of the sd of a gap; and a gap that is nil, in kN, mm or g/cm^3.
-_OF_SD, _ROUNDING = 0.3, 1e-6
-
-
 def misquoted(said: Any, folder: Path) -> str:
     """Say which entries of an `answer` are not those of a diagnosis folder; nothing if all are."""
     try:
@@ -272,7 +268,7 @@ def mispredicted(folder: Path) -> str:
         for g in row_gaps(corrected.data, corrected.mixture.at(corrected.data.view)):
             pairs = np.array([stated[g.output, int(row)] for row in g.rows], dtype=np.float64)
             apart = np.abs(np.stack([g.gap, g.sd], axis=1) - pairs)
-            if (apart > _OF_SD * pairs[:, 1:] + _ROUNDING).any():
+            if (apart > 0.3 * pairs[:, 1:] + 1e-6).any():
                 return "it does not predict the gaps that diagnosis.json states"
     except (CalibError, *FAULTS) as error:
         return f"it cannot be held against its diagnosis ({type(error).__name__}: {error})"

@@ -20,27 +20,19 @@ from scipy.special import log_ndtr
 from calib.gap.forward import Forward
 from calib.gap.gauss_newton import (
     FIRST_STEPS,
-    Ascent,
+    Batch,
+    Iterate,
     Residuals,
     Slope,
-    Stack,
-    climb,
+    batches,
     diagonal,
+    gauss_newton,
     residuals_of_all,
     slopes,
-    stacked,
     variance_left,
 )
 from calib.gap.noise import Noise, ln_averaging, ln_prior
 from calib.models.base import Array
-
-_MAX_STEPS = 40
-# Steps of a truncated fit at a discrepancy alone, which predictions are linear in: the noise that a
-# large one leaves is told at the second.
-_LINEAR_STEPS = 2
-# How many nats behind the best of several truncated fits one is given up, and within how many
-# posterior sds of a better one.
-_WORTH, _NEAR = 6.0, 1.5
 
 
 @dataclass(frozen=True)
@@ -113,8 +105,9 @@ def truncated_fits(starts: Sequence[Start]) -> list[list[Fit]]:
         begun = problem.best(costs, psi, start.count)
         forward, noise = start.forward, dict(start.noise)
         linear = forward.smooth_slices and not forward.hypothesis.effects and forward.shift is None
-        steps = _LINEAR_STEPS if linear else FIRST_STEPS
-        ascents.append([Ascent(problem, psi[i], raw[i], noise, steps) for i in begun])
+        # Predictions are linear in a discrepancy: its noise is known after the second step.
+        steps = 2 if linear else FIRST_STEPS
+        ascents.append([Iterate(problem, psi[i], raw[i], noise, steps) for i in begun])
     return _climbed(ascents)
 
 
@@ -134,7 +127,7 @@ def _worth(begun: Sequence[Fit]) -> list[Fit]:
     ranked = sorted(begun, key=lambda f: -f.log_evidence)
     kept: list[Fit] = []
     for found in ranked:
-        worth = found.log_evidence >= ranked[0].log_evidence - _WORTH
+        worth = found.log_evidence >= ranked[0].log_evidence - 6.0
         if worth and not any(_near(found, other) for other in kept):
             kept.append(found)
     return kept or ranked[:1]
@@ -143,7 +136,7 @@ def _worth(begun: Sequence[Fit]) -> list[Fit]:
 def _near(found: Fit, other: Fit) -> bool:
     """Whether two truncated fits are on the way to the same mode."""
     sd = np.sqrt(np.diag(other.covariance))
-    return bool((np.abs(found.psi - other.psi) < _NEAR * sd).all())
+    return bool((np.abs(found.psi - other.psi) < 1.5 * sd).all())
 
 
 def full_fits(begun: Sequence[Sequence[Fit]]) -> list[list[Fit]]:
@@ -152,23 +145,25 @@ def full_fits(begun: Sequence[Sequence[Fit]]) -> list[list[Fit]]:
     asked = [
         (p, np.stack([f.psi for f in group])) for p, group in zip(problems, begun, strict=True)
     ]
-    return _climbed([
-        [Ascent(p, f.psi, r, dict(f.noise), _MAX_STEPS) for f, r in zip(group, raw, strict=True)]
-        for p, group, raw in zip(problems, begun, residuals_of_all(asked), strict=True)
-    ])  # fmt: skip
+    return _climbed(
+        [
+            [Iterate(p, f.psi, r, dict(f.noise), 40) for f, r in zip(group, raw, strict=True)]
+            for p, group, raw in zip(problems, begun, residuals_of_all(asked), strict=True)
+        ]
+    )
 
 
-def _climbed(ascents: Sequence[Sequence[Ascent]]) -> list[list[Fit]]:
+def _climbed(ascents: Sequence[Sequence[Iterate]]) -> list[list[Fit]]:
     """Climb from guesses at several hypotheses to the modes beside them."""
     everyone = [a for group in ascents for a in group]
-    climb(everyone)
-    found: dict[Ascent, Fit] = {}
-    for stack in stacked(everyone):
+    gauss_newton(everyone)
+    found: dict[Iterate, Fit] = {}
+    for stack in batches(everyone):
         found |= zip(stack.ascents, _laplace(stack, slopes(stack, stack.kept())), strict=True)
     return [[found[a] for a in group] for group in ascents]
 
 
-def _laplace(stack: Stack, slope: Slope) -> list[Fit]:
+def _laplace(stack: Batch, slope: Slope) -> list[Fit]:
     """The normals about modes, and the evidence that they give."""
     # A flat direction is as wide as its prior.
     flat = np.where(stack.precision > 0, 0.0, 1.0 / stack.width**2) * 1e-6
@@ -197,11 +192,15 @@ def _laplace(stack: Stack, slope: Slope) -> list[Fit]:
         field = {o: residual[i, part][n_lab[o] :] for o, part in stack.parts.items()}
         fits.append(
             Fit(
-                problem.forward, psi, _within(problem, covariance), ascent.noise,
+                problem.forward,
+                psi,
+                _within(problem, covariance),
+                ascent.noise,
                 evidence if np.isfinite(evidence) and sign[i] > 0 else -np.inf,
-                float(log_likelihood[i]), field,
+                float(log_likelihood[i]),
+                field,
             )
-        )  # fmt: skip
+        )
     return fits
 
 

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from calib.data.quantities import columns_of
 from calib.gap.campaigns import Campaigns
+from calib.gap.constants import FORM_ERROR, MISFIT
 from calib.gap.discrepancy import THRESHOLDS, Bases, Discrepancy, ShiftMap, shift_map
 from calib.gap.effects import Effect, View
 from calib.gap.hypotheses import Hypothesis
@@ -31,16 +32,19 @@ from calib.inference.priors import Prior, Priors
 from calib.models.base import Array
 
 # Effects to leave out, by their place, of those asked for, by their place.
-type Idle = Mapping[int, Collection[int]]
-_NONE: Idle = {}
+type LeftOut = Mapping[int, Collection[int]]
+_NONE: LeftOut = {}
 type _Rows = slice | NDArray[np.int64]
 # Rows of the predictions, which they are of those of an effect, and what it adds in them.
 type _Added = tuple[_Rows, slice | NDArray[np.bool_], Array]
 
 
-def departed_of_all(
-    asked: Sequence[tuple[Forward, Array]], view: View, plain: dict[str, Array], idle: Idle = _NONE
-) -> dict[str, Array]:  # fmt: skip
+def field_predictions(
+    asked: Sequence[tuple[Forward, Array]],
+    view: View,
+    plain: dict[str, Array],
+    idle: LeftOut = _NONE,
+) -> dict[str, Array]:
     """Add to what simulators predict what hypotheses on the same campaigns say.
 
     An effect is asked once for all hypotheses that have it: of few rows at a time asking takes
@@ -54,20 +58,23 @@ def departed_of_all(
     idle : mapping of int to collection of int
         Effects to leave out of one of those asked, by their place.
     """
-    return Departed(asked, view, plain, idle).at([psi for _, psi in asked])
+    return FieldPrediction(asked, view, plain, idle).at([psi for _, psi in asked])
 
 
-class Departed:
-    """What `departed_of_all` adds, with form errors that may be others later.
+class FieldPrediction:
+    """What `field_predictions` adds, with form errors that may be others later.
 
     The conditions that truly held do not depend on these: simulators are asked once.
     """
 
     @np.errstate(all="ignore")
     def __init__(
-        self, asked: Sequence[tuple[Forward, Array]], view: View, plain: dict[str, Array],
-        idle: Idle = _NONE,
-    ) -> None:  # fmt: skip
+        self,
+        asked: Sequence[tuple[Forward, Array]],
+        view: View,
+        plain: dict[str, Array],
+        idle: LeftOut = _NONE,
+    ) -> None:
         self._view, self._plain = view, plain
         ends = np.cumsum([len(psi) for _, psi in asked]).tolist()
         self._parts = [
@@ -158,9 +165,12 @@ class _Acting:
 
 
 def _acting(
-    parts: Sequence[tuple[Forward, slice]], psi: Sequence[Array], view: View,
-    plain: Mapping[str, Array], idle: Idle,
-) -> list[_Acting]:  # fmt: skip
+    parts: Sequence[tuple[Forward, slice]],
+    psi: Sequence[Array],
+    view: View,
+    plain: Mapping[str, Array],
+    idle: LeftOut,
+) -> list[_Acting]:
     """Effects, each once: what happens first, then what instruments make of it, by name."""
     places: dict[str, list[tuple[int, int]]] = {}
     for j, (forward, _) in enumerate(parts):
@@ -186,9 +196,13 @@ def _acting(
 
 
 def _added(
-    forward: Forward, shared: Array, name: str, view: View, acting: Sequence[_Acting],
+    forward: Forward,
+    shared: Array,
+    name: str,
+    view: View,
+    acting: Sequence[_Acting],
     plain: Array,
-) -> list[list[_Added]]:  # fmt: skip
+) -> list[list[_Added]]:
     """What each effect adds to one output by the conditions that truly held, by its formula."""
     role, simulated = forward.roles[name], forward.simulated[name]
     t, misfit = shared[:, forward.theta_slices[name]], shared[:, forward.misfit_slices[name]]
@@ -235,12 +249,12 @@ def _changed(
     What an effect adds to the output, given those before it, departs from its formula by a factor
     of its own.
     """
-    location = plain.copy()
+    mean = plain.copy()
     for _, factor, added in acting:
         for rows, some, change in added:
-            location[rows] += change * factor[some]
+            mean[rows] += change * factor[some]
     for a, factor, _ in acting:
-        here = location[a.rows]
+        here = mean[a.rows]
         changed = a.effect.on_output(a.phi, role, here, a.view)
         if changed is not here:
             change = changed - here
@@ -248,8 +262,8 @@ def _changed(
             if any(k.at_most and k.output == role for k in a.effect.known):
                 np.maximum(change, -a.effect.most(a.phi, role, here, a.view), out=change)
             change += here
-            location[a.rows] = change
-    return location
+            mean[a.rows] = change
+    return mean
 
 
 def _seen(view: View, base: Mapping[str, Array], rows: _Rows | NDArray[np.bool_]) -> View:
@@ -257,19 +271,6 @@ def _seen(view: View, base: Mapping[str, Array], rows: _Rows | NDArray[np.bool_]
     return view.with_base({role: values[rows] for role, values in base.items()})
 
 
-# Relative size by which a formula may misrepresent its effect along one direction: the effect's
-# size, its tilt and bend over slip, its tilt over other conditions. Estimated from the true
-# effects in 690 single-effect cases of `calib challenge make` (seeds 271828, 577215, 314159,
-# 173205, 602214), pull and rut: 0.13 and 0.12 over slip, 0.08 and 0.06 its bend, 0.12 and 0.06
-# over pressure, 0.28 and 0.16 where a gauge's error takes a simulator to pressures it was not
-# fitted at (less since it goes on straight there, see `Simulated.predict_beyond`), 0.18 and 0.17
-# over what the effect is named for; density: 0.16 over cone index, 0.06 over water content.
-FORM_ERROR = {
-    "size": 0.2, "slip": 0.15, "bend": 0.1, "pressure": 0.13, "cone": 0.15, "water": 0.1,
-    "shape": 0.18, "extrapolation": 0.2,
-}  # fmt: skip
-# Inadequacy of a simulator at the end of the lab's range of a condition, in noise sds.
-MISFIT = 1.0
 # A prediction without a value is none, whatever the warnings.
 _SILENT = np.errstate(all="ignore")
 
@@ -407,7 +408,7 @@ class Forward:
     def _predict(self, psi: Array, output: str, conditions: Mapping[str, Array]) -> Array:
         """Simulator and its inadequacy at conditions (n,), on the scale of the response."""
         t, misfit = psi[:, self.theta_slices[output]], psi[:, self.misfit_slices[output]]
-        # Guesses and differences mostly leave the parameters of a simulator as in the row before.
+        # Consecutive vectors often share the simulator's parameters: it is called once for them.
         new = (t[1:] != t[:-1]).any(axis=1) | (misfit[1:] != misfit[:-1]).any(axis=1)
         if new.all():
             return self.simulated[output].predict(t, misfit, conditions)
@@ -479,7 +480,7 @@ class Forward:
 
     def departed(self, psi: Array, view: View, plain: dict[str, Array]) -> dict[str, Array]:
         """Add effects and discrepancies to what simulators predict."""
-        return departed_of_all([(self, psi)], view, plain)
+        return field_predictions([(self, psi)], view, plain)
 
     @_SILENT
     def field_and_plain(self, psi: Array, view: View) -> tuple[dict[str, Array], dict[str, Array]]:
@@ -490,15 +491,18 @@ class Forward:
 
 @_SILENT
 def fields_of_all(
-    asked: Sequence[tuple[Forward, Array]], view: View, plain: dict[str, Array], idle: Idle = _NONE
+    asked: Sequence[tuple[Forward, Array]],
+    view: View,
+    plain: dict[str, Array],
+    idle: LeftOut = _NONE,
 ) -> dict[str, Array]:
-    """Predict field rows with hypotheses on the same campaigns in force, as `departed_of_all` does.
+    """Predict field rows under hypotheses on the same campaigns, as `field_predictions` does.
 
     Simulators of those with a shift are at other parameters than in `plain`.
     """
     shifted = [part for part in asked if part[0].shift is not None]
     if not shifted:
-        return departed_of_all(asked, view, plain, idle)
+        return field_predictions(asked, view, plain, idle)
     there = _shifted_of_all(shifted, view)
     if len(shifted) < len(asked):
         of_it = np.concatenate([np.full(len(psi), f.shift is not None) for f, psi in asked])
@@ -506,7 +510,7 @@ def fields_of_all(
         for name, values in there.items():
             plain[name][of_it] = values
         there = plain
-    return departed_of_all(asked, view, there, idle)
+    return field_predictions(asked, view, there, idle)
 
 
 def _shifted_of_all(asked: Sequence[tuple[Forward, Array]], view: View) -> dict[str, Array]:
@@ -525,9 +529,10 @@ def _shifted_of_all(asked: Sequence[tuple[Forward, Array]], view: View) -> dict[
     for name, s in some.simulated.items():
         moved = np.concatenate([shift @ by.parameters[name].T for by, shift in shifts])
         found[name] = s.predict(
-            shared[:, some.theta_slices[name]] + moved, shared[:, some.misfit_slices[name]],
+            shared[:, some.theta_slices[name]] + moved,
+            shared[:, some.misfit_slices[name]],
             _shifted(errors, s.conditions(view)),
-        )  # fmt: skip
+        )
     return found
 
 
@@ -548,9 +553,17 @@ def _append(entries: list[Prior], new: Sequence[Prior]) -> slice:
 
 def _uniform(name: str, lower: float, upper: float) -> Prior:
     return Prior(
-        name, "1", "", "", f"uniform({lower:g}, {upper:g})", False, 0.5 * (lower + upper), np.inf,
-        lower, upper,
-    )  # fmt: skip
+        name,
+        "1",
+        "",
+        "",
+        f"uniform({lower:g}, {upper:g})",
+        False,
+        0.5 * (lower + upper),
+        np.inf,
+        lower,
+        upper,
+    )
 
 
 @lru_cache(maxsize=256)

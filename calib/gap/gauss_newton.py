@@ -25,13 +25,6 @@ from calib.gap.noise import Noise, ln_averaged, most_probable
 from calib.inference.sampling.mode import prior_widths
 from calib.models.base import Array
 
-# Guesses closer than this (in prior sds) climb to the same mode.
-_APART = 0.7
-# Step of differences, in prior sds.
-_DIFFERENCE = 1e-4
-# Vectors at once whose predictions stay in the processor's cache.
-_AT_ONCE = 1024
-
 
 class Coordinates:
     """The parameters of a hypothesis, or of several: what their priors say, shape (d,) or (m, d).
@@ -113,7 +106,7 @@ class Coordinates:
         return np.asarray(change / self._steps(psi)[:, :, None])
 
     def _steps(self, psi: Array) -> Array:
-        step = _DIFFERENCE * self.width
+        step = 1e-4 * self.width
         return np.where(psi + step > self.upper, -step, step)
 
     def update_noises(self, raw: Array, left: Array) -> list[dict[str, Noise]]:
@@ -205,7 +198,7 @@ class Residuals(Coordinates):
         """Return which candidates are best and lie apart from each other, at most `count`."""
         picked: list[int] = []
         for i in np.argsort(np.where(np.isfinite(costs), costs, np.inf), kind="stable").tolist():
-            apart = np.abs((candidates[picked] - candidates[i]) / self.width).max(axis=1) > _APART
+            apart = np.abs((candidates[picked] - candidates[i]) / self.width).max(axis=1) > 0.7
             if apart.all():
                 picked.append(i)
             if len(picked) == count:
@@ -222,7 +215,7 @@ def residuals_of_all(asked: Sequence[tuple[Residuals, Array]]) -> list[Array]:
     batch: list[int] = []
     size = 0
     for i, (_, psi) in enumerate(asked):
-        if batch and size + len(psi) > _AT_ONCE:
+        if batch and size + len(psi) > 1024:  # predictions stay in the processor's cache
             found |= _batched(asked, batch)
             batch, size = [], 0
         batch.append(i)
@@ -244,24 +237,18 @@ def _batched(asked: Sequence[tuple[Residuals, Array]], batch: list[int]) -> dict
 
 
 # Asks for problems' residuals at some psi (k, d), is sent them (k, N), until it has a result.
-type Walk[T] = Generator[list[tuple[Residuals, Array]], list[Array], T]
+type Requests[T] = Generator[list[tuple[Residuals, Array]], list[Array], T]
 
-# Dampings that are tried at each step, relative to the last that was good.
-_DAMPINGS = np.array([0.1, 10.0, 1000.0])
-# So little damping is none.
-_WHOLE = 1e-9
 # An ascent with so few nats to gain, and noise that changes by so little, is a step from its mode.
 # One that keeps gaining nothing of what its slope promises, at a kink or a bound, ends as well.
 _BESIDE, _NOTHING, _SETTLED = 1e-2, 1e-3, 1e-2
 # Steps of a truncated fit, which is not ended before.
 FIRST_STEPS = 3
-# Ascents whose derivatives stay in the processor's cache.
-_STACKED = 16
 # What is taken of coordinates that one hypothesis lacks and others have: nothing depends on them.
 _LACKING = {"loc": 0.0, "precision": 1.0, "width": 1.0, "lower": -np.inf, "upper": np.inf}
 
 
-def together[T](walks: Sequence[Walk[T]]) -> list[T]:
+def run_in_step[T](walks: Sequence[Requests[T]]) -> list[T]:
     """Run walks on the same campaigns in step and return their results."""
     results: dict[int, T] = {}
     asked: dict[int, list[tuple[Residuals, Array]]] = {}
@@ -277,9 +264,12 @@ def together[T](walks: Sequence[Walk[T]]) -> list[T]:
 
 
 def _go_on[T](
-    i: int, walk: Walk[T], raw: list[Array] | None,
-    asked: dict[int, list[tuple[Residuals, Array]]], results: dict[int, T],
-) -> None:  # fmt: skip
+    i: int,
+    walk: Requests[T],
+    raw: list[Array] | None,
+    asked: dict[int, list[tuple[Residuals, Array]]],
+    results: dict[int, T],
+) -> None:
     """Send one walk what it asked for; keep its next question or its result."""
     try:
         asked[i] = next(walk) if raw is None else walk.send(raw)
@@ -288,7 +278,7 @@ def _go_on[T](
 
 
 @dataclass(eq=False)
-class Ascent:
+class Iterate:
     """One guess on its way to the mode beside it.
 
     Parameters
@@ -314,7 +304,7 @@ class Ascent:
     quiet: int = 0
 
 
-class Stack(Coordinates):
+class Batch(Coordinates):
     """Where ascents stand, in arrays as wide as that of the most coordinates, D.
 
     Attributes
@@ -324,7 +314,7 @@ class Stack(Coordinates):
     dampings : ndarray, shape (m, 1)
     """
 
-    def __init__(self, ascents: Sequence[Ascent]) -> None:
+    def __init__(self, ascents: Sequence[Iterate]) -> None:
         super().__init__(ascents[0].problem.data)
         self.ascents = ascents
         for name, value in _LACKING.items():
@@ -354,13 +344,13 @@ class Stack(Coordinates):
             setattr(other, name, getattr(self, name)[:, None])
         return other
 
-    def residuals(self, points: Array) -> Walk[Array]:
+    def residuals(self, points: Array) -> Requests[Array]:
         """Evaluate at several points of each, shapes (m, t, D) to (m, t, N)."""
         asked = [(p, points[rows, :, : p.loc.size]) for p, rows in self._parts]
         answers = yield [(p, some.reshape(-1, p.loc.size)) for p, some in asked]
         return np.concatenate([a.reshape(-1, points.shape[1], a.shape[1]) for a in answers])
 
-    def derivatives(self) -> Walk[Array]:
+    def derivatives(self) -> Requests[Array]:
         """Derivatives of the residuals where each stands, shape (m, D, N)."""
         points = self.around(self.psi).reshape(*self.psi.shape, -1)
         answers = yield [
@@ -377,10 +367,10 @@ class Stack(Coordinates):
         return found
 
 
-def stacked(ascents: Sequence[Ascent]) -> list[Stack]:
+def batches(ascents: Sequence[Iterate]) -> list[Batch]:
     """Stacks of ascents of about as many coordinates."""
     alike = sorted(ascents, key=lambda a: a.psi.size)
-    return [Stack(list(some)) for some in batched(alike, _STACKED)]
+    return [Batch(list(some)) for some in batched(alike, 16)]
 
 
 def _wide(rows: Sequence[Array], value: float) -> Array:
@@ -421,14 +411,14 @@ class Slope:
         return variance_left(self.scaled, np.linalg.inv(self.hessian + diagonal(self.flat)))
 
 
-def climb(ascents: Sequence[Ascent]) -> None:
+def gauss_newton(ascents: Sequence[Iterate]) -> None:
     """Climb from guesses to the modes beside them; the ascents are moved in place."""
     going = ascents
     while going := [a for a in going if a.steps and a.quiet < 2]:
-        together([_advance(stack) for stack in stacked(going)])
+        run_in_step([_advance(stack) for stack in batches(going)])
 
 
-def _advance(stack: Stack) -> Walk[None]:
+def _advance(stack: Batch) -> Requests[None]:
     """One step of each."""
     ascents = stack.ascents
     jacobian = yield from stack.derivatives()
@@ -445,7 +435,7 @@ def _advance(stack: Stack) -> Walk[None]:
         ascent.steps -= 1
 
 
-def _end_beside_modes(stack: Stack, slope: Slope) -> None:
+def _end_beside_modes(stack: Batch, slope: Slope) -> None:
     """Leave ascents that are beside their modes one more step."""
     if all(a.steps <= FIRST_STEPS for a in stack.ascents):
         return
@@ -458,7 +448,7 @@ def _end_beside_modes(stack: Stack, slope: Slope) -> None:
             ascent.steps = 1
 
 
-def slopes(stack: Stack, jacobian: Array) -> Slope:
+def slopes(stack: Batch, jacobian: Array) -> Slope:
     """Slope and curvature of ascents where they stand, by derivatives, shape (m, d, N)."""
     sds = np.stack([a.problem.sds(a.noise) for a in stack.ascents])
     scaled = jacobian / sds[:, None]
@@ -470,13 +460,13 @@ def slopes(stack: Stack, jacobian: Array) -> Slope:
     return Slope(sds, scaled, gradient, hessian, 1e-6 / stack.width**2)
 
 
-def _step(stack: Stack, slope: Slope) -> Walk[list[float]]:
+def _step(stack: Batch, slope: Slope) -> Requests[list[float]]:
     """One Levenberg-Marquardt step of each: several dampings tried in one batched call.
 
     Returns what each gained; without a step the next dampings are larger.
     """
     psi, each = stack.psi, stack.each
-    dampings = stack.dampings * _DAMPINGS
+    dampings = stack.dampings * np.array([0.1, 10.0, 1000.0])
     tried = each.clip(psi[:, None] + _directions(stack, psi, slope, dampings))
     there = yield from stack.residuals(tried)
     cost = stack.costs(psi, stack.raw, slope.sds)
@@ -508,9 +498,9 @@ def _directions(stack: Coordinates, psi: Array, slope: Slope, dampings: Array) -
     return np.asarray(-np.linalg.solve(damped, gradient[:, None, :, None])[..., 0])
 
 
-def _left_to_gain(stack: Stack, slope: Slope) -> Array:
+def _left_to_gain(stack: Batch, slope: Slope) -> Array:
     """What a whole step would gain in nats, if all were linear, shape (m,)."""
-    step = _directions(stack, stack.psi, slope, np.full((len(stack.psi), 1), _WHOLE))[:, 0]
+    step = _directions(stack, stack.psi, slope, np.full((len(stack.psi), 1), 1e-9))[:, 0]
     return np.asarray(-0.5 * (step * slope.gradient).sum(axis=1))
 
 

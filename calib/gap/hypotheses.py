@@ -2,14 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from calib.data.quantities import OUTPUTS, QUANTITIES, role_of
+from calib.errors import CalibError
 from calib.gap.campaigns import Campaigns, columns_over, other_conditions
+from calib.gap.case import Context, Size
+from calib.gap.constants import (
+    COVERED,
+    ONSET,
+    SELDOM,
+    SHIFTS,
+    SMOOTHS,
+    SOIL,
+    UNDERINFLATED,
+    UNUSUAL_SIZE,
+    WIDE,
+    WIDER,
+    WIDER_LOG,
+)
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.effects.dependence import DependsOn, DiffersBy, ReadingDrift, ReadingStep
 from calib.inference.prior_files import (
@@ -18,7 +33,7 @@ from calib.inference.prior_files import (
     default_priors,
     read_priors,
 )
-from calib.inference.priors import Priors, prior_references
+from calib.inference.priors import Prior, Priors, prior_references
 
 type ShiftAs = Literal["alone", "soil"]
 type Setting = Literal["pressure", "speed", "passes", "water"]
@@ -81,44 +96,14 @@ class Hypothesis:
     share: float = 1.0
 
 
-# Prior probabilities of the kinds, but for pairs; singles share theirs equally, and a given pair is
-# a twenty-fifth as probable as a given single effect: effects come independently, each in one of
-# some 25 campaigns. (0.03 to 0.05 do equally well: what easy cases gain the hard ones lose.)
-# The probabilities of 900 cases of
-# `calib challenge make` (seeds 271828, 577215, 314159) needed no tempering before shifts of soils
-# were told from others: an exponent of 1/1.1 changed the mean log probability of the truth by
-# 0.0006 +- 0.0022, 1/0.9 took 0.006 from it.
-PRIOR = {"none": 0.40, "unknown": 0.12, "parameter_shift": 0.12, "single": 0.36}
-LN_PAIR_TO_SINGLE = float(np.log(0.04))
-LN_PRIOR: Mapping[str, float] = {k: float(np.log(v)) for k, v in PRIOR.items()}
-SHIFTS = (0.1, 0.25, 0.6)
-# Part of the shifts in which the parameters move together, as another soil moves them: most, for
-# soils differ from one campaign to the next, but a shift may have other reasons. (With the first
-# form of the table, half or nine tenths changed the mean log probability of the truth in 166 cases,
-# shifts and their rivals, by 0.01.)
-SOIL = 2.0 / 3.0
-# Sizes (noise sds) of a free discrepancy.
-SMOOTHS = (1.5, 5.0)
-# Size (noise sds) of a discrepancy that sets in beyond a threshold.
-ONSET = 4.0
-# Part of `unknown` that an underinflated tyre has, whichever output shows it.
-UNDERINFLATED = 0.06
-# How often something unlisted, of a size that would be noticed, comes on top of listed causes: no
-# measured gap is of a formula's shape alone. (Named `<causes>+unknown`.)
-REMAINDER = 0.15
-# Sizes of priors have heavy tails: one in ten effects is several times as large as its prior says.
-WIDE, WIDER, WIDER_LOG = 0.1, 4.0, 2.0
-# How probable it is, beside that of a listed effect, that an output depends on a condition for
-# which an effect is listed in another way than that effect says.
-COVERED = 0.02
-# The same of a reading other than the drawbar cell's that drifts or jumps over the runs: what is
-# gauged by hand does so more seldom. (As probable as an unlisted onset, whose place they take.)
-SELDOM = 0.2
 # Conditions that listed effects are about, and those effects.
 _COVERED_BY = {
-    "speed": "rate_effect", "passes": "multipass_compaction", "water": "moisture_softening",
-    "slip": "slip_sinkage", "pressure": "pressure_gauge_bias",
-}  # fmt: skip
+    "speed": "rate_effect",
+    "passes": "multipass_compaction",
+    "water": "moisture_softening",
+    "slip": "slip_sinkage",
+    "pressure": "pressure_gauge_bias",
+}
 # Roles of conditions that go with each other: who knows one of them ignores none.
 _SAME: Mapping[str, set[str]] = {
     role: same
@@ -133,8 +118,9 @@ type _Touched = tuple[str, ...]
 # slip sinkage and rebound: what is unlisted does so more seldom. (Beyond some run it is always a
 # drift or a step, which may set in anywhere. Nobody could tell the unlisted from them.)
 _LISTED_ONSETS: tuple[tuple[_Over, str], ...] = (
-    ("slip", "pull"), ("slip", "sinkage"),
-)  # fmt: skip
+    ("slip", "pull"),
+    ("slip", "sinkage"),
+)
 
 
 def split_testable(
@@ -203,13 +189,13 @@ def readings(data: Campaigns) -> dict[str, Effect]:
     return found
 
 
-def with_own(data: Campaigns, effects: Mapping[str, Effect]) -> dict[str, Effect]:
+def with_case_effects(data: Campaigns, effects: Mapping[str, Effect]) -> dict[str, Effect]:
     """Return effects, and those that a case brings with it: dependences, and its readings'."""
     own = {**dependences(data), **readings(data)}
     return {**effects, **{name: effect for name, effect in own.items() if name not in effects}}
 
 
-def aside(effect: Effect, listed: Collection[str]) -> float | None:
+def prior_share(effect: Effect, listed: Collection[str]) -> float | None:
     """How probable an effect is beside a listed one that is tried in sets; None if it is such."""
     if covered(effect, listed):
         return COVERED
@@ -293,11 +279,14 @@ def unknowns(data: Campaigns) -> list[Hypothesis]:
     ]
     sudden = [
         Hypothesis(
-            "unknown", smooth=ONSET, smooth_outputs=t, onset_over=over,
+            "unknown",
+            smooth=ONSET,
+            smooth_outputs=t,
+            onset_over=over,
             share=SELDOM if (over, t) in seldom else 1.0,
         )
         for over, t in setting_in
-    ]  # fmt: skip
+    ]
     often = sum(h.share for h in sudden)
     # At low inflation a tyre may creep on its rim, buckle or run on it.
     soft: list[Hypothesis] = []
@@ -319,7 +308,7 @@ def _varies(data: Campaigns, over: str) -> bool:
     return any(np.ptp(recorded[c]) > 0 for c in columns_over(over) if c in recorded)
 
 
-def with_remainder(data: Campaigns, causes: Hypothesis) -> list[Hypothesis]:
+def with_residual_discrepancy(data: Campaigns, causes: Hypothesis) -> list[Hypothesis]:
     """Listed causes, or a shift, and besides them something that is not listed."""
     overs: list[tuple[SmoothOver, float]] = [("level", SMOOTHS[0])]
     overs += [("all", size) for size in SMOOTHS]
@@ -391,3 +380,93 @@ def joined(*causes: Hypothesis) -> Hypothesis:
         tuple(priors for _, _, priors in parts),
         share=float(np.prod([h.share for h in causes])),
     )
+
+
+def with_known_size(single: Hypothesis, context: Context) -> Hypothesis:
+    """Return an effect with what a context says of its size in the place of its prior.
+
+    Raises
+    ------
+    CalibError
+        If it has no such parameter, or the mean is not within the bounds of its prior.
+    """
+    known = context.sizes.get(single.name)
+    if not known:
+        return single
+    (priors,) = single.effect_priors
+    names = [p.name for p in priors.free]
+    if strange := set(known) - {*names}:
+        raise CalibError(
+            f"{single.name} has no parameter {min(strange)!r}",
+            where="[context] sizes",
+            expected=", ".join(names),
+            hint="correct the name",
+        )
+    entries = tuple(
+        _known(single.name, p, known[p.name]) if p.name in known else p for p in priors.entries
+    )
+    return replace(single, effect_priors=(Priors(entries, priors.text, priors.source),))
+
+
+def _known(effect: str, p: Prior, size: Size) -> Prior:
+    """Return a prior with a known mean and sd."""
+    if p.log and size.mean <= 0.0:
+        raise CalibError(
+            f"{effect}: {p.name} is positive",
+            where="[context] sizes",
+            expected="a mean above zero",
+            hint="correct it",
+        )
+    loc, scale = _on_prior_scale(size, p)
+    if not p.lower <= loc <= p.upper:
+        low, high = (np.exp(end) if p.log else end for end in (p.lower, p.upper))
+        raise CalibError(
+            f"{effect}: {p.name} cannot be {size.mean:g}",
+            where="[context] sizes",
+            expected=f"a mean from {low:g} to {high:g}",
+            hint="correct it, or declare an effect of your own with another prior",
+        )
+    return replace(p, loc=loc, scale=scale)
+
+
+def unusual_sizes(single: Sequence[Hypothesis], context: Context) -> list[str]:
+    """Say which known sizes are far from the usual ones, as in another unit.
+
+    Parameters
+    ----------
+    single : sequence of Hypothesis
+        Effects by themselves, with their usual priors.
+    """
+    units = parameter_units(single)
+    said = []
+    for h in single:
+        for p in h.effect_priors[0].free:
+            size = context.sizes.get(h.name, {}).get(p.name)
+            if size is None:
+                continue
+            loc, scale = _on_prior_scale(size, p)
+            apart = abs(loc - p.loc) / float(np.hypot(scale, p.scale))
+            if apart > UNUSUAL_SIZE:
+                low, high = (p.loc + s * p.scale for s in (-1.0, 1.0))
+                low, high = (float(np.exp(e)) if p.log else e for e in (low, high))
+                said.append(
+                    f"[context] sizes: {h.name} is said to have {p.name} {size.mean:g} ± "
+                    f"{size.sd:g}{units[h.name, p.name]}, {apart:.0f} sds from what is usual "
+                    f"({low:.3g} to {high:.3g}): check its sign and unit, for the diagnosis "
+                    "takes it as it is"
+                )
+    return said
+
+
+def parameter_units(single: Sequence[Hypothesis]) -> dict[tuple[str, str], str]:
+    """Return the unit of each effect's parameters, with a space before it; empty if it has none."""
+    return {
+        (h.name, p.name): "" if p.unit in {"1", "dimensionless", ""} else f" {p.unit}"
+        for h in single
+        for p in h.effect_priors[0].free
+    }
+
+
+def _on_prior_scale(size: Size, p: Prior) -> tuple[float, float]:
+    """Mean and sd, of the logarithm where the prior is of that."""
+    return (float(np.log(size.mean)), size.sd / size.mean) if p.log else (size.mean, size.sd)

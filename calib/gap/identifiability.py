@@ -19,27 +19,21 @@ import numpy as np
 
 from calib.data.quantities import QUANTITIES, role_of
 from calib.gap.campaigns import Campaigns
+from calib.gap.constants import ALIKE, MIN_EFFECT_SIZE, PRIOR
 from calib.gap.effects import View
 from calib.gap.fit import Fit
 from calib.gap.forward import Forward
-from calib.gap.hypotheses import LN_PRIOR, Hypothesis
+from calib.gap.hypotheses import Hypothesis
 from calib.gap.noise import Noise, noise_conditions
-from calib.gap.odds import RELEVANT
 from calib.inference.random import generator
 from calib.inference.sampling.mode import hessian_scale, prior_widths
 from calib.models.base import Array
 
-# Draws of each effect's prior: for its sizes (which gives the detectable ones to 1 %), and of these
-# for how alike effects look.
-_N_SIZES, _N_DRAWS = 512, 64
-_Z_POWER = 0.8416  # 80 % power
-_LN_ODDS = float(np.log(10.0))  # an effect shows when it is ten times as probable as none
-ALIKE = 0.95
-_NOTHING, _NEAR = 1e-6, 1e-4  # noise sds
+_NOTHING = 1e-6  # noise sds
 
 
 @dataclass(frozen=True)
-class Isolability:
+class Identifiability:
     """What the design can show.
 
     Parameters
@@ -49,7 +43,7 @@ class Isolability:
     detectable : mapping of str to float
         Smallest size that is told from noise with 80 % power, in noise sds rms over the field rows
         of the output where it is largest; infinite if no believable size is.
-    likeness : mapping of (str, str) to float
+    cosine_similarity : mapping of (str, str) to float
         Cosine between what is left of two effects, best match over their priors.
     idle : tuple of str
         Effects that change nothing the models of this case predict.
@@ -57,22 +51,22 @@ class Isolability:
 
     absorbed: Mapping[str, float]
     detectable: Mapping[str, float]
-    likeness: Mapping[tuple[str, str], float]
+    cosine_similarity: Mapping[tuple[str, str], float]
     idle: tuple[str, ...] = ()
 
     @property
     def alike(self) -> list[tuple[str, str]]:
         """Pairs that this design cannot tell apart."""
-        return [pair for pair, value in self.likeness.items() if value >= ALIKE]
+        return [pair for pair, value in self.cosine_similarity.items() if value >= ALIKE]
 
 
-def isolability(
+def identifiability(
     data: Campaigns,
     single: list[Hypothesis],
     lab_mode: Mapping[str, Array],
     noise: Mapping[str, Noise],
     seed: int,
-) -> Isolability:
+) -> Identifiability:
     """Work out what each effect would do on a design.
 
     Parameters
@@ -88,7 +82,8 @@ def isolability(
     raw = {name: g for name, g in raw.items() if name not in idle}
     left = {name: g @ root.T for name, g in raw.items()}
     rows = [o.rows.size for o in data.outputs]
-    ln_odds = _LN_ODDS + LN_PRIOR["none"] - LN_PRIOR["single"] + np.log(max(len(single), 1))
+    # An effect shows when it is ten times as probable as none.
+    ln_odds = np.log(10.0 * PRIOR["none"] / PRIOR["single"] * max(len(single), 1))
     absorbed, detectable = {}, {}
     for name, g in raw.items():
         total = np.square(g).sum(axis=1)
@@ -99,13 +94,13 @@ def isolability(
         size = np.sqrt(np.max([part.mean(axis=1) for part in parts], axis=0))
         sd = size[seen] / np.sqrt(np.maximum(kept[seen], 1e-300))
         detectable[name] = smallest_shown(size, float(np.median(sd)), float(ln_odds))
-    return Isolability(absorbed, detectable, _likeness(left), idle)
+    return Identifiability(absorbed, detectable, _cosine_similarities(left), idle)
 
 
 def smallest_shown(prior: Array, sd: float, ln_odds: float) -> float:
     """Find the size of an effect that is told from noise in 80 % of campaigns.
 
-    An effect counts from `calib.gap.odds.RELEVANT` on, so its evidence is that of a prior
+    An effect counts from `calib.gap.odds.MIN_EFFECT_SIZE` on, so its evidence is that of a prior
     without smaller sizes.
 
     Parameters
@@ -122,7 +117,7 @@ def smallest_shown(prior: Array, sd: float, ln_odds: float) -> float:
     float
         Infinite if no size that is believable will do.
     """
-    relevant = prior[prior >= RELEVANT]
+    relevant = prior[prior >= MIN_EFFECT_SIZE]
     if not relevant.size:
         return float("inf")
 
@@ -139,17 +134,17 @@ def smallest_shown(prior: Array, sd: float, ln_odds: float) -> float:
         return float("inf")
     # The evidence grows with the estimate, faster and faster: Newton's steps come down to the root
     # and never pass it. (SciPy's search comes with all its optimisers: a tenth of a second.)
-    while first > 0.0 and value / slope > _NEAR:
+    while first > 0.0 and value / slope > 1e-4:
         first = max(first - value / slope, 0.0)
         value, slope = beyond(first)
-    return first + _Z_POWER * sd
+    return first + 0.8416 * sd  # 80 % power
 
 
-def _likeness(left: Mapping[str, Array]) -> dict[tuple[str, str], float]:
+def _cosine_similarities(left: Mapping[str, Array]) -> dict[tuple[str, str], float]:
     unit = {}
     for name, g in left.items():
         length = np.linalg.norm(g, axis=1, keepdims=True)
-        unit[name] = (g / np.maximum(length, 1e-300))[length[:, 0] > 1e-6][:_N_DRAWS]
+        unit[name] = (g / np.maximum(length, 1e-300))[length[:, 0] > 1e-6][:64]
     names = sorted(unit)
     found = {}
     for i, a in enumerate(names):
@@ -163,12 +158,15 @@ def _likeness(left: Mapping[str, Array]) -> dict[tuple[str, str], float]:
 
 
 def _signatures(
-    data: Campaigns, h: Hypothesis, lab_mode: Mapping[str, Array], noise: Mapping[str, Noise],
+    data: Campaigns,
+    h: Hypothesis,
+    lab_mode: Mapping[str, Array],
+    noise: Mapping[str, Noise],
     seed: int,
-) -> Array:  # fmt: skip
+) -> Array:
     """Signatures of prior draws over all field rows and outputs, shape (draws, N)."""
     forward = Forward(data, h, {o: n.sigma for o, n in noise.items()})
-    psi = forward.priors.sample(generator(seed, "gap", "isolability", h.name), _N_SIZES)
+    psi = forward.priors.sample(generator(seed, "gap", "isolability", h.name), 512)
     for o in data.outputs:
         psi[:, forward.theta_slices[o.name]] = lab_mode[o.name]
     plain = forward.simulator(psi, data.view)
@@ -211,10 +209,6 @@ def _metric_root(
         root[start : start + b.shape[0], start : start + b.shape[0]] = b
         start += b.shape[0]
     return root
-
-
-_N_CANDIDATES = 400
-_N_PREDICTED = 200
 
 
 @dataclass(frozen=True)
@@ -268,15 +262,15 @@ def _candidates(data: Campaigns, rng: np.random.Generator) -> dict[str, Array]:
             continue
         both = np.concatenate([values, lab.get(name, values)])
         if role == "slip":
-            candidates[name] = rng.uniform(both.min(), both.max(), _N_CANDIDATES)
+            candidates[name] = rng.uniform(both.min(), both.max(), 400)
         elif role == "order":
-            candidates[name] = np.full(_N_CANDIDATES, data.view.order_range[1])
+            candidates[name] = np.full(400, data.view.order_range[1])
         else:
-            candidates[name] = rng.choice(np.unique(both), _N_CANDIDATES)
+            candidates[name] = rng.choice(np.unique(both), 400)
     pressures = [data.view.column(role) or "" for role in ("pressure", "ground_pressure")]
     if all(p in candidates for p in pressures):
         # The two go together: pick rows, not values.
-        row = rng.integers(len(data.case.field), size=_N_CANDIDATES)
+        row = rng.integers(len(data.case.field), size=400)
         for p in pressures:
             candidates[p] = data.view.conditions[p][row]
     return candidates
@@ -284,7 +278,7 @@ def _candidates(data: Campaigns, rng: np.random.Generator) -> dict[str, Array]:
 
 def _moments(data: Campaigns, fit: Fit, view: View, seed: int) -> dict[str, tuple[Array, Array]]:
     """Predictive mean and variance of each output on the scale of the response, (n,) each."""
-    psi = fit.draws(generator(seed, "gap", "moments", fit.forward.hypothesis.name), _N_PREDICTED)
+    psi = fit.draws(generator(seed, "gap", "moments", fit.forward.hypothesis.name), 200)
     with np.errstate(all="ignore"):
         location = fit.forward.field(psi, view)
     found = {}
@@ -299,7 +293,7 @@ def _moments(data: Campaigns, fit: Fit, view: View, seed: int) -> dict[str, tupl
 
 def _gain(a: dict[str, tuple[Array, Array]], b: dict[str, tuple[Array, Array]]) -> Array:
     """Half the symmetric Kullback-Leibler divergence of two normal predictions, (n,)."""
-    total: Array = np.zeros(_N_CANDIDATES)
+    total: Array = np.zeros(400)
     for name, (mean_a, var_a) in a.items():
         mean_b, var_b = b[name]
         squared = np.square(mean_a - mean_b)

@@ -39,19 +39,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
+from calib.gap.constants import PLENTY
 from calib.gap.fit import Fit
-from calib.gap.forward import Departed
+from calib.gap.forward import FieldPrediction
 from calib.gap.gauss_newton import Residuals
 from calib.inference.random import generator
 from calib.inference.sampling.proposal import StudentT, log_sum, tempered_moments
 from calib.models.base import Array
-
-# Draws whose predictions stay in the processor's cache; more at once take twice as long each.
-_DENSITY_BATCH = 512
-# What is not quite linear has longer tails than its normal.
-_WIDER = 1.1
-# The least factor by which an effect is divided, to know what its formula alone adds.
-_LEAST = 0.2
 
 
 class Density:
@@ -80,9 +74,11 @@ class Density:
             np.arange(problem.loc.size), np.concatenate([self._integrated, self._forms])
         )
         self._field = np.concatenate(
-            [np.arange(p.start + o.problem.response.size, p.stop)
-             for o, p in zip(data.outputs, problem.parts.values(), strict=True)]
-        )  # fmt: skip
+            [
+                np.arange(p.start + o.problem.response.size, p.stop)
+                for o, p in zip(data.outputs, problem.parts.values(), strict=True)
+            ]
+        )
 
     @property
     def covariance(self) -> Array:
@@ -112,8 +108,8 @@ class Density:
         psi[:, self.drawn], psi[:, self._integrated] = drawn, 0.0
         found = np.full(len(psi), -np.inf)
         inside = np.flatnonzero(np.isfinite(self._forward.priors.log_prob(psi)))
-        for i in range(0, inside.size, _DENSITY_BATCH):
-            some = inside[i : i + _DENSITY_BATCH]
+        for i in range(0, inside.size, 512):
+            some = inside[i : i + 512]
             found[some], psi[some] = self._evaluate(self._problem.clip(psi[some]), rng)
         return found, psi
 
@@ -123,7 +119,7 @@ class Density:
         if not self._forms.size:
             return self._log_joint(psi, problem.raw(psi)), psi
         lab, plain = forward.plain(psi)
-        departed = Departed([(forward, psi)], forward.data.view, plain)
+        departed = FieldPrediction([(forward, psi)], forward.data.view, plain)
         full = departed.at([psi])
         left = self._white(problem.beside(lab, full)[:, self._field] / self._field_sds)
         basis = self._form_basis(psi, departed, full)
@@ -141,7 +137,7 @@ class Density:
         total = prior - 0.5 * np.square(left).sum(axis=1)
         return np.where(np.isfinite(total), total + self._constant, -np.inf)
 
-    def _form_basis(self, psi: Array, departed: Departed, full: dict[str, Array]) -> Array:
+    def _form_basis(self, psi: Array, departed: FieldPrediction, full: dict[str, Array]) -> Array:
         """Minus the derivatives of white residuals by form errors, shape (k, m, n)."""
         forward = self._forward
         found = np.zeros((len(psi), self._forms.size, self._field.size))
@@ -156,7 +152,7 @@ class Density:
                 if part.stop == part.start:
                     continue
                 # At all draws the form errors are those of the mode here.
-                factor = np.maximum(1.0 + basis[o.rows] @ self._fit.psi[part], _LEAST)
+                factor = np.maximum(1.0 + basis[o.rows] @ self._fit.psi[part], 0.2)
                 change = (full[o.name] - without[o.name])[:, o.rows]
                 change /= factor * self._field_sds[rows]
                 change[~np.isfinite(change)] = 0.0
@@ -177,10 +173,11 @@ class Density:
         precision += np.diag(self._problem.precision[self._forms] ** 2)
         root = np.linalg.cholesky(precision)
         normal = rng.standard_normal(moment.shape)
-        moment += _WIDER * (root @ normal[..., None])[..., 0]
+        # Longer tails than the normal's, for what is not quite linear.
+        moment += 1.1 * (root @ normal[..., None])[..., 0]
         ln_q = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
         ln_q -= 0.5 * np.square(normal).sum(axis=1)
-        ln_q -= self._forms.size * (np.log(_WIDER) + 0.5 * np.log(2.0 * np.pi))
+        ln_q -= self._forms.size * (np.log(1.1) + 0.5 * np.log(2.0 * np.pi))
         return np.linalg.solve(precision, moment[..., None])[..., 0], ln_q
 
     def completed(self, psi: Array, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -241,17 +238,6 @@ class Density:
         return total
 
 
-_ROUNDS, _SIZE, _FINAL, _KEPT = 7, 2000, 4000, 1500
-# Tails heavy enough for the long ends of sizes that an exponent makes up for.
-_DOF = 6.0
-# Fewer effective draws than this do not replace the normal.
-_ENOUGH = 120.0
-# With this many the evidence is within 0.04 nats (one sd), which moves no probability by more than
-# 0.01. With fewer that of bent posteriors comes out lower as well: on average over eight seeds 400
-# moved a probability of the shared cases by 0.07, 800 one by 0.02.
-PLENTY = 1280
-
-
 def refine(fit: Fit, seed: int, plenty: int = PLENTY) -> Fit:
     """Return a fit with draws of its posterior and the evidence that they give.
 
@@ -271,11 +257,11 @@ def refine(fit: Fit, seed: int, plenty: int = PLENTY) -> Fit:
     )
     density = Density(fit)
     try:
-        proposal = StudentT(density.mode, np.linalg.cholesky(density.covariance), _DOF)
+        proposal = StudentT(density.mode, np.linalg.cholesky(density.covariance), 6.0)
     except np.linalg.LinAlgError:
         return fit
     pool = _Pool(density)
-    for size in (*(_SIZE,) * _ROUNDS, _FINAL):
+    for size in (*(2000,) * 7, 4000):
         pool.add(proposal, rng, size)
         log_weight = pool.log_weight()
         total = float(logsumexp(log_weight))
@@ -288,11 +274,11 @@ def refine(fit: Fit, seed: int, plenty: int = PLENTY) -> Fit:
         moved = tempered_moments(pool.draws, log_weight)
         if moved is None:
             return fit
-        proposal = StudentT(*moved, _DOF)
-    if effective < _ENOUGH:
+        proposal = StudentT(*moved, 6.0)
+    if effective < 120.0:
         return fit
     # Systematic resampling: equal weights at the least added noise.
-    at = (rng.random() + np.arange(_KEPT)) / _KEPT
+    at = (rng.random() + np.arange(1500)) / 1500
     picked = np.minimum(np.searchsorted(np.cumsum(weight), at), weight.size - 1)
     # Draws of what was integrated out stay those at the noise of the fit: weighted with the factor
     # three of four would be lost.
@@ -307,7 +293,7 @@ def _ln_mean(ln: Array) -> float:
     carried all: seeds were apart by 4 nats, which two cumulants hold to 0.2.
     """
     weight = np.exp(ln - ln.max())
-    if weight.sum() ** 2 >= _ENOUGH * np.square(weight).sum():
+    if weight.sum() ** 2 >= 120.0 * np.square(weight).sum():
         return float(logsumexp(ln) - np.log(ln.size))
     return float(ln.mean() + 0.5 * ln.var())
 

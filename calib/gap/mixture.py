@@ -12,18 +12,13 @@ from numpy.typing import NDArray
 from calib.data import Table
 from calib.data.quantities import OUTPUTS, columns_of
 from calib.gap.campaigns import Campaigns, other_conditions
+from calib.gap.constants import SHARE_ERROR
 from calib.gap.effects import View
 from calib.gap.fit import Fit
 from calib.gap.noise import noise_conditions
 from calib.gap.ranking import Ranking
 from calib.inference.random import generator
 from calib.models.base import Array
-
-N_DRAWS = 1200
-# Hypotheses less probable than this are not drawn from.
-_NEGLIGIBLE = 2e-3
-# Draws of each that are kept.
-_KEPT = 500
 
 
 @dataclass(frozen=True)
@@ -104,11 +99,16 @@ class Mixture:
         )
 
     def _part(
-        self, fit: Fit, probability: float, view: View, index: int, without: str | None,
+        self,
+        fit: Fit,
+        probability: float,
+        view: View,
+        index: int,
+        without: str | None,
         left_out: Collection[str],
-    ) -> Truth:  # fmt: skip
+    ) -> Truth:
         """Draw under one hypothesis; the weights carry its probability."""
-        size = max(100, int(N_DRAWS * probability))
+        size = max(100, int(1200 * probability))
         rng = generator(self.seed, "gap", "truth", fit.forward.hypothesis.name, index)
         psi = fit.draws(rng, size)
         full, plain = fit.forward.field_and_plain(psi, view)
@@ -137,7 +137,7 @@ def mixture(data: Campaigns, ranking: Ranking, seed: int) -> Mixture:
     fits: list[Fit] = []
     weights: list[float] = []
     for name in ranking.order:
-        if ranking.probability[name] < _NEGLIGIBLE and fits:
+        if ranking.probability[name] < 2e-3 and fits:
             continue
         group = ranking.fits[name]
         score = np.array(ranking.scores[name])
@@ -158,21 +158,22 @@ def _thinned(fit: Fit) -> Fit:
     """
     if fit.sample is None:
         return fit
-    return replace(fit, sample=fit.sample[:: max(len(fit.sample) // _KEPT, 1)])
+    return replace(fit, sample=fit.sample[:: max(len(fit.sample) // 500, 1)])
 
 
 # Physical roles of the conditions, in the order in which a reader looks for a cause; others follow.
 _ROLES = (
-    "slip", "pressure", "ground_pressure", "speed", "passes", "water", "water_by_volume", "cone",
-    "load", "order",
-)  # fmt: skip
-# The fewest rows of a region: this part of an output's rows, and two.
-_FEWEST_PART, _FEWEST_ROWS = 1 / 12, 2
-_MOST_REGIONS = 3
-# Why a row was not judged by.
-_NO_READING = "there is no reading"
-_SET_ASIDE = "the reading was set aside as an outlier or as no reading at all"
-_MOVED = "the conditions were set aside as a mistake; the gap is where they typically are"
+    "slip",
+    "pressure",
+    "ground_pressure",
+    "speed",
+    "passes",
+    "water",
+    "water_by_volume",
+    "cone",
+    "load",
+    "order",
+)
 
 
 @dataclass(frozen=True)
@@ -264,10 +265,18 @@ def unused_rows(data: Campaigns, field: Table) -> dict[str, dict[int, str]]:
     for o in data.outputs:
         read = np.isfinite(field[OUTPUTS[o.name]])
         found[o.name] = {
-            int(row): _NO_READING if not read[row] else _MOVED if moved[row] else _SET_ASIDE
+            int(row): _why(bool(read[row]), bool(moved[row]))
             for row in np.setdiff1d(np.arange(len(field)), o.rows)
         }
     return found
+
+
+def _why(read: bool, moved: bool) -> str:
+    if not read:
+        return "there is no reading"
+    if moved:
+        return "the conditions were set aside as a mistake; the gap is where they typically are"
+    return "the reading was set aside as an outlier or as no reading at all"
 
 
 def regions(data: Campaigns, truth: Truth, gaps: tuple[RowGap, ...]) -> tuple[Region, ...]:
@@ -283,7 +292,7 @@ def regions(data: Campaigns, truth: Truth, gaps: tuple[RowGap, ...]) -> tuple[Re
         left = np.ones(o.rows.size, dtype=bool)
         searched = conditions_to_search(data)
         varied = [n for n in searched if np.ptp(data.view.conditions[n][o.rows]) > 0.0]
-        for _ in range(_MOST_REGIONS):
+        for _ in range(3):
             best: tuple[float, Region, NDArray[np.bool_]] | None = None
             # Where none varies one stands for all rows.
             for name in varied or searched[:1]:
@@ -304,9 +313,13 @@ def regions(data: Campaigns, truth: Truth, gaps: tuple[RowGap, ...]) -> tuple[Re
 
 
 def _region(
-    truth: Truth, output: str, conditions: Mapping[str, tuple[float, float]], draws: Array,
-    noise: Array, inside: NDArray[np.bool_],
-) -> Region:  # fmt: skip
+    truth: Truth,
+    output: str,
+    conditions: Mapping[str, tuple[float, float]],
+    draws: Array,
+    noise: Array,
+    inside: NDArray[np.bool_],
+) -> Region:
     mean = draws[:, inside].mean(axis=1)
     beyond = np.abs(mean) > noise[:, inside].mean(axis=1)
     ends = _quantile(truth, mean, 0.05), _quantile(truth, mean, 0.95)
@@ -329,7 +342,7 @@ def _stretches(
     groups = np.array_split(distinct, distinct.size if category else min(8, distinct.size))
     rows = [(values >= group[0]) & (values <= group[-1]) & left for group in groups]
     signs = [_sign(gap, inside) for inside in rows]
-    fewest = max(_FEWEST_ROWS, int(_FEWEST_PART * values.size))
+    fewest = max(2, values.size // 12)
     found = []
     for (sign, _), run in groupby(
         range(len(groups)), key=lambda i: (signs[i], i if category else 0)
@@ -350,14 +363,6 @@ def _sign(gap: RowGap, inside: NDArray[np.bool_]) -> float:
 
 
 UNLISTED = "unknown"
-_N_SHARES = 800
-# What a cause alone is said to do is wrong by so much (relative): what fits the sum of several as
-# well may go to another of them, by more than a formula is wrong about a cause alone. It changes no
-# share of a cause that acts alone. Of 347 causes of development cases (large gaps of 4243 and 4244)
-# 90 % intervals hold 290 with 0.2, 301 with 0.3, 307 with 0.4; of 78 (hard, 4244) 69, 70 and 70.
-_SIZE_ERROR = 0.35
-# Below this the remainder's place is nowhere.
-_SOMEWHERE = 0.1
 
 
 @dataclass(frozen=True)
@@ -377,14 +382,14 @@ class Inclusion:
     ----------
     causes : mapping of str to Included
         Effects, dependences and ``parameter_shift``, the most probable first.
-    remainder : Included
+    residual_discrepancy : Included
         Something unlisted, alone or beside listed causes.
     where : tuple of Region
         Where the remainder lies.
     """
 
     causes: Mapping[str, Included]
-    remainder: Included
+    residual_discrepancy: Included
     where: tuple[Region, ...]
 
     @property
@@ -426,9 +431,9 @@ def inclusion(mixed: Mixture, ranking: Ranking) -> Inclusion:
         name: Included(found.get(name, 0.0), *_mean_and_interval(shares[:, i], weight))
         for i, name in enumerate([*names, UNLISTED])
     }
-    remainder = included.pop(UNLISTED)
-    where = _where(data, mixed) if remainder.probability >= _SOMEWHERE else ()
-    return Inclusion(included, remainder, where)
+    rest = included.pop(UNLISTED)
+    where = _where(data, mixed) if rest.probability >= 0.1 else ()
+    return Inclusion(included, rest, where)
 
 
 def _shares(mixed: Mixture, names: list[str]) -> tuple[Array, Array]:
@@ -438,10 +443,10 @@ def _shares(mixed: Mixture, names: list[str]) -> tuple[Array, Array]:
         causes = fit.forward.causes
         if not causes:
             continue
-        size = max(60, int(_N_SHARES * probability))
+        size = max(60, int(800 * probability))
         rng = generator(mixed.seed, "gap", "shares", fit.forward.hypothesis.name, i)
         rms = _sizes(mixed.data, fit, fit.draws(rng, size))
-        rms *= np.exp(_SIZE_ERROR * rng.standard_normal(rms.shape))
+        rms *= np.exp(SHARE_ERROR * rng.standard_normal(rms.shape))
         rms = rms[np.isfinite(rms).all(axis=1) & (rms.sum(axis=1) > 0.0)]
         part = np.zeros((rms.shape[0], len(names)))
         part[:, [names.index(c) for c in causes]] = rms / rms.sum(axis=1, keepdims=True)

@@ -12,17 +12,10 @@ from scipy.special import gammaln
 
 from calib.data import Table
 from calib.data.quantities import columns_of
+from calib.gap.constants import KAPPA, LN_KAPPA_PRIOR, LN_RHO_PRIOR, RHO
 from calib.gap.effects import View
 from calib.inference.sampling.proposal import log_sum
 from calib.models.base import Array
-
-# Growth of the noise with slip: sigma (1 + rho s), and the prior probability of each.
-RHO = np.array([0.0, 1.0, 2.5, 5.0])
-LN_RHO_PRIOR = np.log(np.array([0.5, 0.2, 0.15, 0.15]))
-# Growth as the inflation pressure falls: (p_lab / p)^kappa. A soft tyre's pull and ruts are less
-# regular; in the source's drawbar pull the noise at 18 psi is twice that at 42 psi (kappa 0.8).
-KAPPA = np.array([0.0, 0.8, -0.8])
-LN_KAPPA_PRIOR = np.log(np.array([0.7, 0.2, 0.1]))
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """Prior odds, relevance and posterior probabilities of hypotheses.
 
-Every hypothesis but `none` is the claim that its effect is *relevant*: that in some output its
-root-mean-square size over the field rows is at least `RELEVANT` noise sds (of several causes: that
-each of them is at least `RELEVANT_IN_PAIR`).
+Every hypothesis but `none` claims that its effect has at least a minimum size: in some output its
+root mean square over the field rows is `MIN_EFFECT_SIZE` noise sds or more (each of several causes:
+`MIN_EFFECT_SIZE_IN_PAIR`).
 Restricting its prior to relevant sizes multiplies its evidence by
 
     P(relevant | data, hypothesis) / P(relevant | hypothesis),
@@ -36,20 +36,23 @@ from scipy.special import logsumexp
 
 from calib.gap.campaigns import Campaigns
 from calib.gap.case import Context
+from calib.gap.constants import (
+    LEFT,
+    MIN_EFFECT_SIZE,
+    MIN_EFFECT_SIZE_IN_PAIR,
+    MOST_LEFT,
+    PAIR_TO_SINGLE,
+    PRIOR,
+    RESIDUAL_DISCREPANCY,
+)
 from calib.gap.fit import Fit
 from calib.gap.forward import Forward, fields_of_all
-from calib.gap.hypotheses import LN_PAIR_TO_SINGLE, LN_PRIOR, REMAINDER
 from calib.gap.noise import Noise, noise_conditions
 from calib.inference.random import generator, latin
 from calib.models.base import Array
 
-RELEVANT = 1.5
-RELEVANT_IN_PAIR = 1.0
-# Rows whose predictions stay in the processor's cache.
-_AT_ONCE = 1024
 
-
-def relevance(asked: Sequence[tuple[Fit, int]], seed: int) -> list[float]:
+def ln_size_restriction(asked: Sequence[tuple[Fit, int]], seed: int) -> list[float]:
     """Log of the factor by which restricting hypotheses to relevant sizes changes their evidence.
 
     Parameters
@@ -62,9 +65,9 @@ def relevance(asked: Sequence[tuple[Fit, int]], seed: int) -> list[float]:
     drawn = [psi for i in known for psi in _drawn(*asked[i], seed)]
     fits = [asked[i][0] for i in known for _ in range(2)]
     found = [0.0] * len(asked)
-    every = sizes_of_all([
-        (fit.forward, fit.noise, psi) for fit, psi in zip(fits, drawn, strict=True)
-    ])  # fmt: skip
+    every = sizes_of_all(
+        [(fit.forward, fit.noise, psi) for fit, psi in zip(fits, drawn, strict=True)]
+    )
     for i, (posterior, prior) in zip(known, batched(every, 2), strict=True):
         found[i] = _log_share(posterior)
         # What is relevant in no draw of the prior is no likelier for being restricted to that.
@@ -94,7 +97,7 @@ def _relevant(size: Array) -> NDArray[np.bool_]:
     """Which draws are relevant, of those for which the model has a value."""
     # Those for which it has none say nothing either way.
     size = size[np.isfinite(size).all(axis=1)]
-    threshold = RELEVANT if size.shape[1] == 1 else RELEVANT_IN_PAIR
+    threshold = MIN_EFFECT_SIZE if size.shape[1] == 1 else MIN_EFFECT_SIZE_IN_PAIR
     return np.asarray((size >= threshold).all(axis=1))
 
 
@@ -117,7 +120,7 @@ def sizes_of_all(asked: Sequence[tuple[Forward, Mapping[str, Noise], Array]]) ->
     """
     found: list[list[Array]] = [[] for _ in asked]
     batch: list[tuple[int, Array]] = []
-    room = _AT_ONCE
+    room = 1024
 
     def ask() -> None:
         parts = [(*asked[i][:2], psi) for i, psi in batch]
@@ -127,10 +130,10 @@ def sizes_of_all(asked: Sequence[tuple[Forward, Mapping[str, Noise], Array]]) ->
 
     for i, (forward, _, psi) in enumerate(asked):
         each = 1 + len(forward.causes)
-        for some in np.array_split(psi, max(1, -(-len(psi) * each // _AT_ONCE))):
+        for some in np.array_split(psi, max(1, -(-len(psi) * each // 1024))):
             if len(some) * each > room:
                 ask()
-                room = _AT_ONCE
+                room = 1024
             batch.append((i, some))
             room -= len(some) * each
     ask()
@@ -193,21 +196,12 @@ def _rms(
     }
 
 
-# Part of a gap that no formula has the shape of, and the most of that in noise sds. Where true
-# single effects of other mechanics, of 5 to 24 noise sds, were fitted free of noise, 0.1 to 1.4
-# noise sds were left, mostly half a one. Of 600 large gaps of `calib challenge make` (seeds
-# 11127825, 266368679, 69484247, 77595611, 113300765) the mean log score is -1.170 with these,
-# -1.217 with none, -1.195 with 0.05 of the gap however large it is, and 6 are wrong at 0.9 or more
-# (18, 14) where 5.4 are expected (9.5, 7.0). 0.07 to 0.1 with 0.5 to 0.7 do equally well.
-LEFT, MOST_LEFT = 0.08, 0.6
-
-
 def left_of(gap: float) -> float:
     """Return what no formula has the shape of, in noise sds as the gap's size is."""
     return min(LEFT * gap, MOST_LEFT)
 
 
-def coarsening(gap: float) -> float:
+def likelihood_tempering(gap: float) -> float:
     """Return the exponent's inverse T for a gap's size in noise sds."""
     return 1.0 + left_of(gap) ** 2
 
@@ -241,7 +235,7 @@ class Odds:
         """Take what is suspected into account."""
         plain = cls(n_single, {})
         usual = {
-            name: float(np.exp(plain.ln_prior(name)) / (1.0 - REMAINDER))
+            name: float(np.exp(plain.ln_prior(name)) / (1.0 - RESIDUAL_DISCREPANCY))
             for name in context.suspected
         }
         return cls(
@@ -252,15 +246,15 @@ class Odds:
     def ln_prior(self, name: str) -> float:
         """Log probability of a hypothesis, up to a constant."""
         if name in ("none", "unknown"):
-            return LN_PRIOR[name]
+            return float(np.log(PRIOR[name]))
         causes = name.split("+")
         listed = [c for c in causes if c != "unknown"]
-        rest = REMAINDER if len(listed) < len(causes) else 1.0 - REMAINDER
+        rest = RESIDUAL_DISCREPANCY if len(listed) < len(causes) else 1.0 - RESIDUAL_DISCREPANCY
         prior = float(np.log(rest)) + sum(self.suspicion.get(c, 0.0) for c in listed)
         if listed == ["parameter_shift"]:
-            return LN_PRIOR["parameter_shift"] + prior
-        single = LN_PRIOR["single"] - float(np.log(max(self.n_single, 1)))
-        return single + (len(listed) - 1) * LN_PAIR_TO_SINGLE + prior
+            return float(np.log(PRIOR["parameter_shift"])) + prior
+        single = float(np.log(PRIOR["single"] / max(self.n_single, 1)))
+        return single + (len(listed) - 1) * float(np.log(PAIR_TO_SINGLE)) + prior
 
 
 def _logit(p: float) -> float:

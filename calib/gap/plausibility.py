@@ -19,29 +19,33 @@ from calib.data.checks import (
 from calib.data.files import plain_number
 from calib.data.quantities import OUTPUTS, QUANTITIES, Quantity, columns_of, role_of
 from calib.gap.campaigns import Campaigns, OutputData, identical_rows
+from calib.gap.constants import (
+    FAR_RATIO,
+    HELD,
+    NEAR_UNIT,
+    NOISIER,
+    ODD_RATIO,
+    PERCENT_RATIO,
+    ROUGHLY_UNIT,
+)
 from calib.gap.fit import Fit
 from calib.gap.ranking import Ranking
 from calib.models import get_model
 from calib.models.base import Array
 from calib.validation.residuals import Check, Remark, failed, unexplained, unused
 
-# Typical outputs of two campaigns differ by less than this, whatever acts in the field.
-_ODD_RATIO = 4.0
-# Typical conditions of two campaigns, their ranges overlapping, differ by less than this.
-_FAR_RATIO = 10.0
-# So far apart are fractions of two campaigns of which one may be in percent: 100, give or take 2.
-_PERCENT = 50.0
 # Factors between units that are taken for one another, with one that a quantity has to have, and
 # how near a ratio has to come (sd of a logarithm); conditions are other ones in every campaign, so
 # roughly will do.
 _UNITS = {
-    6.895: ("psi and kPa", "psi"), 10.0: ("mm and cm", "cm"), 25.4: ("inches and mm", "inch"),
-    4.448: ("lbf and N", "lbf"), 9.807: ("kgf and N", "kgf"),
-    100.0: ("a fraction and percent", "percent"), 1000.0: ("thousandths and wholes", None),
-}  # fmt: skip
-_NEAR, _ROUGHLY = 0.15, 0.4
-# A covariate that was held in the calibration, to this part, is known well enough to be recognised.
-_HELD = 0.05
+    6.895: ("psi and kPa", "psi"),
+    10.0: ("mm and cm", "cm"),
+    25.4: ("inches and mm", "inch"),
+    4.448: ("lbf and N", "lbf"),
+    9.807: ("kgf and N", "kgf"),
+    100.0: ("a fraction and percent", "percent"),
+    1000.0: ("thousandths and wholes", None),
+}
 
 
 def oddities(lab: Table, field: Table, models: Mapping[str, str]) -> tuple[str, ...]:
@@ -87,7 +91,7 @@ def oddities(lab: Table, field: Table, models: Mapping[str, str]) -> tuple[str, 
     states = [c for role in ("speed", "passes", "water") for c in columns_of(role)]
     both = [n for n in states if n in lab and n in field]
     # A speed that scatters by a few per cent was held.
-    scatter = {n: 2.0 * _HELD * float(np.median(np.abs(lab[n]))) for n in both}
+    scatter = {n: 2.0 * HELD * float(np.median(np.abs(lab[n]))) for n in both}
     varied = [n for n in both if np.ptp(lab[n]) > scatter[n] and np.ptp(field[n]) == 0.0]
     if varied:
         said.append(
@@ -140,10 +144,10 @@ def _other_units(lab: Table, field: Table, models: Mapping[str, str]) -> list[st
     for name in sorted(conditions & set(lab) & set(field)):
         apart = field[name].min() > lab[name].max() or field[name].max() < lab[name].min()
         ratio = _typical(field[name]) / max(_typical(lab[name]), 1e-300)
-        if not apart and not 1.0 / _FAR_RATIO < ratio < _FAR_RATIO:
+        if not apart and not 1.0 / FAR_RATIO < ratio < FAR_RATIO:
             said.append(
-                f"{_compared(lab, field, name, _ROUGHLY)}; if the field's is in another unit, the "
-                "diagnosis means nothing"
+                f"{_compared(lab, field, name, ROUGHLY_UNIT)}; if the field's is in another unit, "
+                "the diagnosis means nothing"
             )
         if apart and np.ptp(lab[name]) > 0.0:
             read = usual_in(field, name, field[name], lab[name].min(), lab[name].max())
@@ -158,7 +162,7 @@ def _other_units(lab: Table, field: Table, models: Mapping[str, str]) -> list[st
     for name in outputs:
         if name in lab and name in field:
             ratio = _typical(field[name]) / max(_typical(lab[name]), 1e-300)
-            if not 1.0 / _ODD_RATIO < ratio < _ODD_RATIO:
+            if not 1.0 / ODD_RATIO < ratio < ODD_RATIO:
                 said.append(
                     f"{_compared(lab, field, name)}; if the field's is in another unit, or is "
                     "another column's, the diagnosis means nothing"
@@ -190,20 +194,20 @@ def _covariates(lab: Table, field: Table, used: Collection[str]) -> Iterator[str
             continue
         low, high = (float(f(lab[name])) for f in (np.nanmin, np.nanmax))
         ratio = _typical(field[name]) / max(_typical(lab[name]), 1e-300)
-        bottom, top = (1.0 - _HELD) * low, (1.0 + _HELD) * high
+        bottom, top = (1.0 - HELD) * low, (1.0 + HELD) * high
         as_before = bool(((bottom <= field[name]) & (field[name] <= top)).all())
-        held = low > 0.0 and high <= (1.0 + _HELD) * low and not as_before
+        held = low > 0.0 and high <= (1.0 + HELD) * low and not as_before
         read = usual_in(field, name, field[name], bottom, top) if held else ""
         if read:
             yield (
                 f"{_compared(lab, field, name, 0.0)}, and as in the calibration if "
                 f"the readings are in {read}; check the unit in the column name"
             )
-        elif quantity.unit == "dimensionless" and not 1.0 / _PERCENT < ratio < _PERCENT:
-            yield f"{_compared(lab, field, name, _ROUGHLY)}; check the unit in the column name"
+        elif quantity.unit == "dimensionless" and not 1.0 / PERCENT_RATIO < ratio < PERCENT_RATIO:
+            yield f"{_compared(lab, field, name, ROUGHLY_UNIT)}; check the unit in the column name"
         elif met := _would_meet(field, name, bottom, top):
             yield (
-                f"{_compared(lab, field, name, 0.0)}: every value is more than {_FAR_RATIO:g} "
+                f"{_compared(lab, field, name, 0.0)}: every value is more than {FAR_RATIO:g} "
                 f"times off the calibration's, and would not be if the readings are in {met}; "
                 "check the unit in the column name"
             )
@@ -212,7 +216,7 @@ def _covariates(lab: Table, field: Table, used: Collection[str]) -> Iterator[str
 def _would_meet(field: Table, name: str, low: float, high: float) -> str:
     """Name the units in which a far column of the field would meet the calibration's range."""
     least, most = (float(f(field[name])) for f in (np.nanmin, np.nanmax))
-    if low <= 0.0 or least <= 0.0 or (most * _FAR_RATIO > low and least < high * _FAR_RATIO):
+    if low <= 0.0 or least <= 0.0 or (most * FAR_RATIO > low and least < high * FAR_RATIO):
         return ""
     # A factor brings the ranges together if it brings the field's middle (of logarithms) into the
     # calibration's, widened by the field's own half width.
@@ -224,18 +228,18 @@ def _typical(values: Array) -> float:
     return float(np.nanmedian(np.abs(values)))
 
 
-def _compared(lab: Table, field: Table, name: str, near: float = _NEAR) -> str:
+def _compared(lab: Table, field: Table, name: str, near: float = NEAR_UNIT) -> str:
     """Name a column of the field, and say how the campaigns compare in it."""
     return f"{field.header_of(name)}: {_typically(lab, field, name, near)}"
 
 
-def _typically(lab: Table, field: Table, name: str, near: float = _NEAR) -> str:
+def _typically(lab: Table, field: Table, name: str, near: float = NEAR_UNIT) -> str:
     """Say in the field's unit how typical values of a column compare, and which units do so."""
     column = field.column(name)
     return _times(column.written(lab[name]), column.written(field[name]), column.quantity, near)
 
 
-def _times(lab: Array, field: Array, quantity: Quantity, near: float = _NEAR) -> str:
+def _times(lab: Array, field: Array, quantity: Quantity, near: float = NEAR_UNIT) -> str:
     """Say how the typical values of two columns compare, and which of its units do so nearly."""
     low, high = sorted((_typical(lab), _typical(field)))
     factor = high / max(low, 1e-300)
@@ -250,19 +254,19 @@ def _times(lab: Array, field: Array, quantity: Quantity, near: float = _NEAR) ->
     return f"{typical}, {plain_number(factor)} times {way}{between}"
 
 
-# A field that scatters less than so many times as much as the laboratory is as a field is.
-_NOISIER = 2.0
-
-
 def doubts(data: Campaigns, ranking: Ranking) -> tuple[Remark, ...]:
     """Say what no explanation has: in a field as it says, any is said with a chance of `LEVEL`."""
     best = ranking.best(ranking.order[0])
-    return failed([
-        check
-        for o in data.outputs
-        for check in (*_noisier(data, o, ranking.lab_mode[o.name], best),
-                      *_patterns(data, o, ranking, best))
-    ])  # fmt: skip
+    return failed(
+        [
+            check
+            for o in data.outputs
+            for check in (
+                *_noisier(data, o, ranking.lab_mode[o.name], best),
+                *_patterns(data, o, ranking, best),
+            )
+        ]
+    )
 
 
 def _noisier(data: Campaigns, o: OutputData, mode: Array, best: Fit) -> Iterable[Check]:
@@ -274,9 +278,10 @@ def _noisier(data: Campaigns, o: OutputData, mode: Array, best: Fit) -> Iterable
     noise, left = best.noise[o.name], o.problem.response.size - len(o.priors.free)
     if left < 1:
         return
-    lab = o.problem.response - o.problem.bound.mean_response(
-        o.priors.to_natural(mode[None]), o.problem.conditions
-    )[0]  # fmt: skip
+    lab = (
+        o.problem.response
+        - o.problem.bound.mean_response(o.priors.to_natural(mode[None]), o.problem.conditions)[0]
+    )
     field = best.field_residuals[o.name] * noise.sigma
     grown = data.lab_at[o.name].growth(noise.rho, noise.kappa)
     variance = float(np.square(lab / grown).sum()) / left
@@ -290,12 +295,16 @@ def _noisier(data: Campaigns, o: OutputData, mode: Array, best: Fit) -> Iterable
         f"the field's {o.name.replace('_', ' ')} scatters {plain_number(times, 2)} times as much "
         f"as the laboratory's (sd {sds[0]} against {sds[1]})"
     )
-    yield Check(p if times >= _NOISIER else 1.0, Remark(
-        f"{source_of(data.case.field)}: {said} about the most probable explanation "
-        f"(p = {plain_number(p, 2)}), so something that differs from row to row acts there: "
-        "record what changed between rows (operator, tyre, place) as a column, declare it under "
-        "[covariates] in case.toml, and diagnose again", said,
-    ))  # fmt: skip
+    yield Check(
+        p if times >= NOISIER else 1.0,
+        Remark(
+            f"{source_of(data.case.field)}: {said} about the most probable explanation "
+            f"(p = {plain_number(p, 2)}), so something that differs from row to row acts there: "
+            "record what changed between rows (operator, tyre, place) as a column, declare it "
+            "under [covariates] in case.toml, and diagnose again",
+            said,
+        ),
+    )
 
 
 def _patterns(data: Campaigns, o: OutputData, ranking: Ranking, best: Fit) -> Iterable[Check]:
@@ -308,10 +317,12 @@ def _patterns(data: Campaigns, o: OutputData, ranking: Ranking, best: Fit) -> It
     columns = {h: v for h, v in unused(table, own).items() if h not in data.case.covariates}
     output = o.name.replace("_", " ")
     return unexplained(
-        table, columns, best.field_residuals[o.name],
+        table,
+        columns,
+        best.field_residuals[o.name],
         title=f"the field's {output} differs with {{!r}}, which no model or effect uses",
         hint="declare it under [covariates] in case.toml, and diagnose again",
-    )  # fmt: skip
+    )
 
 
 def _noise_text(o: OutputData, sd: float) -> str:

@@ -11,24 +11,36 @@ from scipy.special import logsumexp
 from calib.errors import CalibError, meant
 from calib.gap.campaigns import Campaigns, OutputData
 from calib.gap.case import Context
+from calib.gap.constants import FOLLOWS_RUNS, PLENTY, SEARCH
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.effects.dependence import ReadingDrift, ReadingStep
 from calib.gap.fit import Fit
-from calib.gap.hypotheses import Hypothesis, aside, shifts, singles, split_testable, wider, with_own
-from calib.gap.identifiability import Isolability, isolability
-from calib.gap.importance import PLENTY, refine
+from calib.gap.hypotheses import (
+    Hypothesis,
+    prior_share,
+    shifts,
+    singles,
+    split_testable,
+    wider,
+    with_case_effects,
+    with_known_size,
+)
+from calib.gap.identifiability import Identifiability, identifiability
+from calib.gap.importance import refine
 from calib.gap.noise import Noise
-from calib.gap.odds import Odds, coarsening, gap_size, probabilities, relevance, with_prior
-from calib.gap.search import Guesses, far_out, sets_and_unlisted
+from calib.gap.odds import (
+    Odds,
+    gap_size,
+    likelihood_tempering,
+    ln_size_restriction,
+    probabilities,
+    with_prior,
+)
+from calib.gap.search import StartingPoints, search_sets, unusually_large
 from calib.inference.estimators.search import check_defined
 from calib.inference.random import generator
 from calib.inference.sampling.mode import find_mode
 from calib.models.base import Array
-
-# What a line or a step has to gain (nats) for a drift or a jump of a reading to be worth a fit:
-# with less, their priors and the freedom of their sizes leave them below a few per cent beside
-# noise alone.
-_WORTH = 4.0
 
 
 def change_over_runs(residual: Array, order: Array) -> float:
@@ -67,25 +79,12 @@ def follows_runs(data: Campaigns, none: Fit) -> set[str]:
     return {
         o.role
         for o in data.outputs
-        if change_over_runs(none.field_residuals[o.name], order[o.rows]) > _WORTH
+        if change_over_runs(none.field_residuals[o.name], order[o.rows]) > FOLLOWS_RUNS
     }
 
 
 # Internal parameters of each simulator, and its noise.
 type Lab = tuple[dict[str, Array], dict[str, Noise]]
-# Draws of the prior by which a row is tried.
-_N_TRIED = 32
-_IDLE = "it changes nothing that the models of this case predict"
-# Draws for the relevance of a hypothesis: of one too far behind to come into play, at first, and
-# while it is in play, times the effective draws of its posterior. Of 938 (33 cases) none gained
-# more than 1.8 nats by its relevance.
-_FAR, _QUICK, _CAREFUL = 32, 96, 1.5
-# A hypothesis is in play within so many nats of the best.
-_IN_PLAY = 4.0
-# Variants of a hypothesis are in play within so many nats of its best; one that is farther behind
-# the best of all than the next of these does not come into play by its relevance, and one farther
-# than the last is not likely, relevant or not.
-_BESIDE, _BEHIND, _FAR_BEHIND = 2.5, _IN_PLAY + 3.0, 10.0
 
 
 @dataclass(frozen=True)
@@ -104,7 +103,7 @@ class Ranking:
         Effect to reason.
     lab_mode : mapping of str to ndarray
         Internal parameters of each simulator as the lab calibrated it.
-    isolability : Isolability
+    identifiability : Identifiability
         What the design could show before its outcomes were looked at.
     odds : Odds
         Probabilities of the hypotheses before the data.
@@ -119,7 +118,7 @@ class Ranking:
     probability: Mapping[str, float]
     not_testable: Mapping[str, str]
     lab_mode: Mapping[str, Array]
-    isolability: Isolability
+    identifiability: Identifiability
     odds: Odds
     gap: float
 
@@ -153,7 +152,7 @@ def rank(
     *,
     effects: Mapping[str, Effect] = EFFECTS,
     lab: Lab | None = None,
-    design: Isolability | None = None,
+    design: Identifiability | None = None,
     plenty: int = PLENTY,
 ) -> Ranking:
     """Fit every hypothesis and rank them.
@@ -163,28 +162,28 @@ def rank(
     effects : mapping of str to Effect, optional
     lab : Lab, optional
         If `calibrate_lab` has been called before.
-    design : Isolability, optional
+    design : Identifiability, optional
         What the design could show, if it is known from a campaign that has all of these rows.
     plenty : int, optional
         Effective draws of a posterior, and draws for its relevance, that are enough.
     """
-    able, unable = split_testable(data, with_own(data, effects))
+    able, unable = split_testable(data, with_case_effects(data, effects))
     lab_mode, noise = lab or calibrate_lab(data, seed)
     single = singles(data, able)
-    shares = {h.name: aside(h.effects[0], able) for h in single}
+    shares = {h.name: prior_share(h.effects[0], able) for h in single}
     beside = {name for name, share in shares.items() if share is not None}
     listed = [h for h in single if h.name not in beside]
-    design = design or isolability(data, listed, lab_mode, noise, seed)
+    design = design or identifiability(data, listed, lab_mode, noise, seed)
     single = [h for h in single if h.name not in design.idle]
-    unable |= dict.fromkeys(design.idle, _IDLE)
+    unable |= dict.fromkeys(design.idle, "it changes nothing that the models of this case predict")
     single = [replace(h, share=shares[h.name] or 1.0) for h in single]
     context = data.case.context
     _check_names(context, {*able, *unable})
-    single = [context.sized(h) for h in single if h.name not in context.excluded]
+    single = [with_known_size(h, context) for h in single if h.name not in context.excluded]
     unable |= dict.fromkeys(context.excluded, "it is excluded in the case's [context]")
     beside -= set(context.excluded)
     odds = Odds.of(len(single) - len(beside), context)
-    guesses = Guesses(data, lab_mode, noise, odds)
+    guesses = StartingPoints(data, lab_mode, noise, odds)
     asked = [h for h in single if not isinstance(h.effects[0], ReadingDrift | ReadingStep)]
     fits = guesses.fit([Hypothesis("none"), *shifts(data), *asked])
     following = follows_runs(data, fits["none"][0])
@@ -195,23 +194,25 @@ def rank(
     fits |= guesses.fit(single[len(asked) :])
     # A size that is known is not several times as large.
     free = [h for h in single if h.name not in context.sizes]
-    far = [h for h in free if far_out(fits[h.name][0], 0, h.effect_priors[0])]
+    far = [h for h in free if unusually_large(fits[h.name][0], 0, h.effect_priors[0])]
     for name, more in guesses.fit([wider(h) for h in far]).items():
         fits[name] += more
-    fits |= sets_and_unlisted(guesses, [h.name for h in single if h.name not in beside], fits)
+    fits |= search_sets(guesses, [h.name for h in single if h.name not in beside], fits)
     fits, scores = _scored(fits, guesses.odds, seed, plenty)
     log_evidence = {name: float(logsumexp(values)) for name, values in scores.items()}
     gap = _gap(fits, scores, log_evidence, guesses.odds)
-    probability = probabilities(log_evidence, guesses.odds, coarsening(gap))
+    probability = probabilities(log_evidence, guesses.odds, likelihood_tempering(gap))
     return Ranking(
         fits, scores, log_evidence, probability, unable, lab_mode, design, guesses.odds, gap
     )
 
 
 def _gap(
-    fits: Mapping[str, tuple[Fit, ...]], scores: Mapping[str, tuple[float, ...]],
-    log_evidence: Mapping[str, float], odds: Odds,
-) -> float:  # fmt: skip
+    fits: Mapping[str, tuple[Fit, ...]],
+    scores: Mapping[str, tuple[float, ...]],
+    log_evidence: Mapping[str, float],
+    odds: Odds,
+) -> float:
     """Size of the gap by the most probable explanation, in noise sds; see `Ranking.gap`."""
     best = max(log_evidence, key=lambda name: log_evidence[name] + odds.ln_prior(name))
     return gap_size(fits[best][int(np.argmax(scores[best]))])
@@ -241,7 +242,9 @@ def _scored(
 
     def draws(promised: float) -> int:
         behind = best - promised
-        return _QUICK if behind < _BEHIND else _FAR if behind < _FAR_BEHIND else 0
+        if behind < SEARCH.relevance_behind:
+            return 96
+        return 32 if behind < SEARCH.relevance_far else 0
 
     every = [(f, draws(p)) for name in fits for f, p in zip(fits[name], promise[name], strict=True)]
     found = iter(_scores(every, seed))
@@ -252,7 +255,7 @@ def _scored(
         tried |= set(asked)
         for name, i in asked:
             refined[name][i] = refine(fits[name][i], seed, plenty)
-        again = _scores([(refined[name][i], round(_CAREFUL * plenty)) for name, i in asked], seed)
+        again = _scores([(refined[name][i], round(1.5 * plenty)) for name, i in asked], seed)
         for (name, i), score in zip(asked, again, strict=True):
             scores[name][i] = score
     return (
@@ -263,18 +266,19 @@ def _scored(
 
 def _in_play(scores: Mapping[str, Sequence[float]], odds: Odds) -> set[tuple[str, int]]:
     """Names of hypotheses that are in play, and the places of their variants that are."""
-    least = max(max(values) + odds.ln_prior(name) for name, values in scores.items()) - _IN_PLAY
+    best = max(max(values) + odds.ln_prior(name) for name, values in scores.items())
+    least = best - SEARCH.in_play
     return {
         (name, i)
         for name, values in scores.items()
         for i, value in enumerate(values)
-        if value > max(values) - _BESIDE and value + odds.ln_prior(name) > least
+        if value > max(values) - SEARCH.variant_in_play and value + odds.ln_prior(name) > least
     }
 
 
 def _scores(asked: Sequence[tuple[Fit, int]], seed: int) -> list[float]:
     """Log of evidence times relevance (if it is drawn) times a variant's share in its name."""
-    relevant = relevance(asked, seed)
+    relevant = ln_size_restriction(asked, seed)
     return [
         f.log_evidence + r + float(np.log(f.forward.hypothesis.share))
         for (f, _), r in zip(asked, relevant, strict=True)
@@ -296,7 +300,7 @@ def calibrate_lab(data: Campaigns, seed: int) -> Lab:
 def _check_defined(data: Campaigns, o: OutputData, rng: np.random.Generator) -> None:
     """Refuse rows of either campaign at which a simulator has no value."""
     problem, field = o.problem, data.case.field
-    theta = o.priors.to_natural(o.priors.sample(rng, _N_TRIED))
+    theta = o.priors.to_natural(o.priors.sample(rng, 32))
     check_defined(
         problem.bound, theta, problem.conditions, data.case.lab.source, problem.table.lines
     )

@@ -13,22 +13,22 @@ from calib.data.checks import mixed_units
 from calib.data.files import plain_number
 from calib.data.quantities import OUTPUTS, QUANTITIES, role_of
 from calib.errors import CalibError
-from calib.gap.campaigns import MAX_RATIO, Campaigns, OutputData, campaigns
+from calib.gap.campaigns import Campaigns, OutputData, campaigns
 from calib.gap.case import Case
+from calib.gap.constants import (
+    FAR_CONDITION,
+    FAR_FACTOR,
+    FAR_PART,
+    FIELD_OUTLIER,
+    IMPOSSIBLE_READING,
+    LAB_OUTLIER,
+    LEFT_OVER,
+    MAX_RATIO,
+    MOST_ROUNDS,
+)
 from calib.gap.ranking import Lab, Ranking, calibrate_lab
 from calib.models import get_model
 from calib.models.base import Array
-
-# Runs may come in any order and number.
-_ANY = "order"
-# A value is far from all others if it lies this part of their range beyond them, and by no less
-# than a factor of `_LEAST_FACTOR`; of quantities that may be negative, than half their size.
-_FAR = 1.5
-_LEAST_FACTOR = 8.0
-# Part of both campaigns that may lie off before it is the campaigns' own way.
-_MOST_FAR = 0.05
-# Of fewer rows nobody knows which is the odd one.
-_FEWEST_ROWS_FAR = 4
 
 
 def check_units(case: Case) -> None:
@@ -64,7 +64,7 @@ def without_far_conditions(case: Case) -> tuple[Case, list[str]]:
     lab, field = case.lab, case.field
     said: list[str] = []
     for name in case.field:
-        if role_of(name) == _ANY or name in OUTPUTS.values() or name not in case.lab:
+        if role_of(name) == "order" or name in OUTPUTS.values() or name not in case.lab:
             continue
         if case.covariates.get(name):  # a category has no distances
             continue
@@ -91,12 +91,12 @@ def _far(values: Array) -> NDArray[np.bool_]:
     positive = bool(values.min() > 0.0)
     u = np.log(values) if positive else values
     order = np.sort(u)
-    k = max(1, int(_MOST_FAR * u.size))
-    if u.size < _FEWEST_ROWS_FAR:
+    k = max(1, int(FAR_PART * u.size))
+    if u.size < 4:
         return np.zeros(u.size, dtype=bool)
     low, high = float(order[k]), float(order[-k - 1])
-    least = float(np.log(_LEAST_FACTOR)) if positive else max(0.5 * max(abs(low), abs(high)), 0.1)
-    reach = max(_FAR * (high - low), least)
+    least = float(np.log(FAR_FACTOR)) if positive else max(0.5 * max(abs(low), abs(high)), 0.1)
+    reach = max(FAR_CONDITION * (high - low), least)
     return np.asarray((u < low - reach) | (u > high + reach))
 
 
@@ -106,7 +106,7 @@ def _in_another_unit(name: str, values: Array) -> NDArray[np.bool_]:
     if known is None:
         return np.zeros(values.size, dtype=np.bool_)
     odd, _ = mixed_units(known, values)
-    return odd & (odd.sum() <= max(1, int(_MOST_FAR * values.size)))
+    return odd & (odd.sum() <= max(1, int(FAR_PART * values.size)))
 
 
 def _without_condition(table: Table, name: str, rows: NDArray[np.int64]) -> Table:
@@ -128,18 +128,6 @@ def _said_conditions(table: Table, name: str, rows: NDArray[np.int64]) -> str:
         f"{table.source}, {at}: far from all other rows of both campaigns, or as in another unit; "
         "left out as a mistake (if it is none, add rows between)"
     )
-
-
-# Standardised residual beyond which a field row is set aside, and how often that is repeated.
-OUTLIER = 5.0
-# In the laboratory the row itself widens the noise, so the unit is a robust sd, and the bar higher.
-LAB_OUTLIER = 8.0
-MOST_ROUNDS = 3
-# A reading so many times the spread of the laboratory's off them is none: a code for "missing", a
-# misplaced decimal point. No gap is a tenth as large.
-_IMPOSSIBLE = 20.0
-# Beyond this a reading is named; of noise alone, one in 2000 readings is.
-LEFT_OVER = 3.5
 
 
 def screen(case: Case, seed: int) -> tuple[Campaigns, Lab, list[str]]:
@@ -181,7 +169,7 @@ def without_field_outliers(data: Campaigns, ranking: Ranking) -> tuple[Campaigns
     far = _field_outliers(data, ranking)
     if not far:
         return data, []
-    said = _said(data.case.field, far, _outlying(OUTLIER))
+    said = _said(data.case.field, far, _outlying(FIELD_OUTLIER))
     return campaigns(without_outputs(data.case, far)), said
 
 
@@ -222,13 +210,13 @@ def _possible(table: Table, case: Case) -> tuple[Table, list[str]]:
     for output in case.models:
         values = table[OUTPUTS[output]]
         low, middle, high = np.nanquantile(case.lab[OUTPUTS[output]], (0.1, 0.5, 0.9))
-        reach = _IMPOSSIBLE * (high - low)
+        reach = IMPOSSIBLE_READING * (high - low)
         off = np.abs(values - middle) > reach
         if reach > 0.0 and 0 < off.sum() < 0.5 * np.isfinite(values).sum():
             far[output] = np.flatnonzero(off).tolist()
     why = (
-        f"more than {_IMPOSSIBLE:g} times the range of the calibration's readings off them; left "
-        "out as no reading at all (leave the cell empty where nothing was measured)"
+        f"more than {IMPOSSIBLE_READING:g} times the range of the calibration's readings off them; "
+        "left out as no reading at all (leave the cell empty where nothing was measured)"
     )
     return _blanked(table, far), _said(table, far, why)
 
@@ -261,7 +249,7 @@ def _field_outliers(data: Campaigns, ranking: Ranking) -> dict[str, list[int]]:
     best = ranking.best(ranking.order[0])
     far = {}
     for o in data.outputs:
-        found = np.abs(best.field_residuals[o.name]) > OUTLIER
+        found = np.abs(best.field_residuals[o.name]) > FIELD_OUTLIER
         if 0 < found.sum() <= _most(o.rows.size):
             far[o.name] = [int(row) for row in o.rows[found]]
     return far

@@ -22,30 +22,22 @@ from functools import partial
 import numpy as np
 
 from calib.gap.campaigns import Campaigns
+from calib.gap.constants import SEARCH, WIDE
 from calib.gap.discrepancy import Bases
 from calib.gap.effects import Effect
 from calib.gap.fit import Fit, Start, finished, truncated_fits
 from calib.gap.forward import Forward
 from calib.gap.gauss_newton import Residuals, residuals_of_all
-from calib.gap.hypotheses import WIDE, Hypothesis, joined, resized, unknowns, with_remainder
+from calib.gap.hypotheses import Hypothesis, joined, resized, unknowns, with_residual_discrepancy
 from calib.gap.noise import Noise
 from calib.gap.odds import Odds, with_prior
 from calib.inference.priors import Priors
 from calib.inference.random import even_points
 from calib.models.base import Array
 
-_N_SCREEN = 64
-_N_BEGUN = 5
-_N_THRESHOLDS = 24
-# Guesses at one more effect of a set, how many of them all others take a step from, and how many
-# of these a fit begins from.
-_N_ADDED, _N_STEPPED, _N_ADDED_BEGUN = 64, 4, 2
-# Parts of a Gauss-Newton step that are tried, for where a whole one goes too far.
-_STEPS = (1.0, 0.3, 0.0)
-
 
 @dataclass(frozen=True)
-class Promise:
+class CandidateSet:
     """A set of causes that may be worth a fit.
 
     Parameters
@@ -54,7 +46,7 @@ class Promise:
         Log of evidence times prior, by the best guess and one step of the other parameters, if the
         posterior is as broad as that of the set it was made from.
     starts : ndarray, shape (k, d)
-        Guesses, the best first.
+        StartingPoints, the best first.
     first : int
         How many of the guesses are the best of a part that the set was made from.
     """
@@ -75,20 +67,24 @@ class Promise:
         """Where a fit begins."""
         return Start(self.forward, self.starts, self.noise, len(self.starts))
 
-    def with_starts_of(self, other: Promise) -> Promise:
+    def with_starts_of(self, other: CandidateSet) -> CandidateSet:
         """Return the better of two promises of a set, with the guesses of both."""
         one, two = sorted((self, other), key=lambda p: -p.expected)
-        parts = (one.starts[: one.first], two.starts[: two.first],
-                 one.starts[one.first :], two.starts[two.first :])  # fmt: skip
+        parts = (
+            one.starts[: one.first],
+            two.starts[: two.first],
+            one.starts[one.first :],
+            two.starts[two.first :],
+        )
         return replace(one, starts=np.concatenate(parts), first=one.first + two.first)
 
-    def parted(self) -> tuple[Promise, Promise]:
+    def parted(self) -> tuple[CandidateSet, CandidateSet]:
         """Part a promise: the best guesses of the parts it was made from, and the others."""
         first, others = self.starts[: self.first], self.starts[self.first :]
         return replace(self, starts=first), replace(self, starts=others)
 
 
-class Guesses:
+class StartingPoints:
     """Begins fits of hypotheses of one case.
 
     Parameters
@@ -122,10 +118,10 @@ class Guesses:
             start = self._onset_start(forward, start)
         if not hypothesis.effects:
             return Start(forward, start[None], self.noise)
-        starts = self._spread(forward, start, _N_SCREEN, range(len(hypothesis.effects)))
-        return Start(forward, np.concatenate([start[None], starts]), self.noise, _N_BEGUN)
+        starts = self._spread(forward, start, SEARCH.guesses, range(len(hypothesis.effects)))
+        return Start(forward, np.concatenate([start[None], starts]), self.noise, SEARCH.started)
 
-    def begun_jointly(self, hypothesis: Hypothesis, members: Sequence[Fit], count: int) -> Start:
+    def start_from(self, hypothesis: Hypothesis, members: Sequence[Fit], count: int) -> Start:
         """Begin where parts of a hypothesis have led, the effects they lack by their prior."""
         if not members:
             return self.begun(hypothesis)
@@ -135,13 +131,13 @@ class Guesses:
             led = _led(forward, start, member)
             known = {e.name for e in member.forward.hypothesis.effects}
             lacking = [i for i, e in enumerate(hypothesis.effects) if e.name not in known]
-            size = _N_SCREEN // len(members) if lacking else 1
+            size = SEARCH.guesses // len(members) if lacking else 1
             parts.append(self._spread(forward, led, size, lacking))
         return Start(forward, np.concatenate(parts), self.noise, count)
 
     def beside(
-        self, kept: Hypothesis, found: Fit, added: Sequence[Hypothesis], size: int = _N_ADDED
-    ) -> list[Promise]:
+        self, kept: Hypothesis, found: Fit, added: Sequence[Hypothesis], size: int = SEARCH.guesses
+    ) -> list[CandidateSet]:
         """Guess at sets of what is kept of one that was fitted and one effect more.
 
         All other parameters take a Gauss-Newton step from each guess, or part of one where a whole
@@ -184,20 +180,20 @@ class Guesses:
             gradient = (left / sds) @ slope.T + off
             step = -np.linalg.solve(hessian, gradient.T).T
             costs = there.costs(begun, left, sds) + 0.5 * (gradient * step).sum(axis=1)
-            best = there.best(costs, begun, _N_STEPPED)
+            best = there.best(costs, begun, SEARCH.stepped)
             own, here = _places(forward, there.forward)
-            starts = np.repeat(begun[best][None], len(_STEPS), axis=0)
-            starts[:, :, here] += np.array(_STEPS)[:, None, None] * step[best][:, own]
+            starts = np.repeat(begun[best][None], 3, axis=0)
+            starts[:, :, here] += np.array([1.0, 0.3, 0.0])[:, None, None] * step[best][:, own]
             stepped.append((there, there.clip(starts.reshape(-1, starts.shape[-1]))))
         cost = float(ended.costs(found.psi[None], at_end, sds)[0])
         promises = []
         for (there, starts), left in zip(stepped, residuals_of_all(stepped), strict=True):
             costs = there.costs(starts, left, sds)
-            best = there.best(costs, starts, _N_ADDED_BEGUN)
+            best = there.best(costs, starts, SEARCH.started_in_set)
             least = float(costs[best[0]])
             gained = cost - least if np.isfinite(least) else -np.inf
             expected = self._expected(there.forward.hypothesis, found, gained)
-            promises.append(Promise(there.forward, expected, starts[best], found.noise))
+            promises.append(CandidateSet(there.forward, expected, starts[best], found.noise))
         return promises
 
     def _expected(self, hypothesis: Hypothesis, found: Fit, gained: float) -> float:
@@ -220,10 +216,10 @@ class Guesses:
         lower, upper = (
             getattr(forward.priors.free[forward.threshold], e) for e in ("lower", "upper")
         )
-        thresholds = np.linspace(lower, upper, _N_THRESHOLDS)
+        thresholds = np.linspace(lower, upper, SEARCH.thresholds)
         plain = forward.simulator(start[None], self.data.view)
-        left = np.zeros(_N_THRESHOLDS)
-        starts = np.repeat(start[None], _N_THRESHOLDS, axis=0)
+        left = np.zeros(SEARCH.thresholds)
+        starts = np.repeat(start[None], SEARCH.thresholds, axis=0)
         starts[:, forward.threshold] = thresholds
         for o in self.data.outputs:
             if o.name not in forward.smooth_slices:
@@ -299,38 +295,9 @@ def _places(old: Forward, new: Forward) -> tuple[Array, Array]:
 # A hypothesis, and fits of parts of it.
 type _Started = tuple[Hypothesis, list[Fit]]
 
-# Effects of which one is in every pair that is tried, and sets of each number of causes from which
-# others are made, if they are within so many nats of the best.
-_N_PAIR_SEEDS, _N_SETS, _MOST_CAUSES, _NEAR_BEST = 4, 2, 4, 5.0
-# Guesses at the second effect of a pair, from either side.
-_N_PAIRED = 32
-# Sets made of others that are fitted at a time, of those that were guessed at. Of 218 that ended
-# within 5 nats of the best (120 cases) 38 were not among the first twelve guesses, 3 not among 24.
-_N_FITTED = 24
-# A posterior has many modes, and which is found depends on the set that was changed. A set is
-# fitted again where a guess from another expects no more than so many nats less, and is changed
-# again when it is found to be so many better. Of 5853 guesses (180 cases) 283 led a set that was in
-# play then to a better mode (by 0.3 to 15 nats).
-_N_AGAIN, _AGAIN, _BETTER = 24, 3.0, 1.0
-# Explanations beside which something unlisted is tried as well.
-_N_LEADING, _N_LEADING_SETS = 7, 3
-# A discrepancy or a pair that is so many nats (prior and all) behind the best hypothesis after a
-# truncated fit is given up. Of 1344 discrepancies and 2698 pairs (14 cases) those that ended
-# within 8 nats of the best were then less than 13.5 and 10.6 behind.
-_HOPELESS = 15.0
-# One within so many nats is begun from more guesses: a pair has many modes.
-_SEARCHED = 8.0
-# A set made of another is given up so many nats behind: of 3684 more than 6 behind (240 cases) 6
-# ended within 5 nats of the best. Other priors ask for more steps than a truncated fit takes.
-_BEHIND, _BEHIND_RESIZED = 6.5, 10.0
-# One of which a guess expects so many nats less than the best set has is not fitted at all.
-_UNPROMISING = 60.0
-# An effect that far out in its prior (sds) is fitted with a wider one as well.
-_FAR_OUT = 2.0
 
-
-def sets_and_unlisted(
-    guesses: Guesses, single: Sequence[str], fits: Mapping[str, tuple[Fit, ...]]
+def search_sets(
+    guesses: StartingPoints, single: Sequence[str], fits: Mapping[str, tuple[Fit, ...]]
 ) -> dict[str, tuple[Fit, ...]]:
     """Fit what is not listed, by itself and beside the best explanations, and sets of effects.
 
@@ -348,30 +315,32 @@ def sets_and_unlisted(
     best = {name: max(group, key=partial(with_prior, odds=n)) for name, group in fits.items()}
     alone = sorted((best[m] for m in best if m != "none"), key=lambda f: -with_prior(f, n))
     others: list[_Started] = [(h, []) for h in unknowns(guesses.data)]
-    others += _with_remainders(guesses, alone[:_N_LEADING])
+    others += _with_residual_discrepancies(guesses, alone[: SEARCH.leading])
     alone_best = max(with_prior(f, n) for f in best.values())
-    pairs = _pairs(guesses, usual, single, best, alone_best - _UNPROMISING)
+    pairs = _pairs(guesses, usual, single, best, alone_best - SEARCH.unpromising)
     n_others = len(others)
-    truncated = truncated_fits([
-        *(guesses.begun_jointly(h, members, 1) for h, members in others),
-        *(p.parted()[0].start for p in pairs),
-    ])  # fmt: skip
+    truncated = truncated_fits(
+        [
+            *(guesses.start_from(h, members, 1) for h, members in others),
+            *(p.parted()[0].start for p in pairs),
+        ]
+    )
     ended_at = [max(with_prior(f, n) for f in group) for group in truncated]
     listed = max([alone_best, *ended_at[n_others:]])
     leading = max([listed, *ended_at[:n_others]])
     promise = partial(_promise, usual, n)
     truncated[n_others:] = _begun_again(promise, pairs, truncated[n_others:], listed)
-    unlisted = sized(_finished(promise, truncated[:n_others], leading - _HOPELESS), leading)
-    sets = sized(_finished(promise, truncated[n_others:], listed - _HOPELESS), listed)
+    unlisted = sized(_finished(promise, truncated[:n_others], leading - SEARCH.hopeless), leading)
+    sets = sized(_finished(promise, truncated[n_others:], listed - SEARCH.hopeless), listed)
     # What is unlisted takes up what any listed causes leave: these are compared without it.
     listed = max(with_prior(f, n) for f in (*best.values(), *sets))
     sets += _stepwise(guesses, [best[m] for m in single], usual, sets, listed)
     sets = _best_of_each(sets)
     leading = max(leading, *(with_prior(f, n) for f in (*unlisted, *sets)))
-    top = _leading(sets, leading - _SEARCHED, n, _N_LEADING_SETS)
-    beside = _with_remainders(guesses, top)
-    truncated = truncated_fits([guesses.begun_jointly(h, of, 1) for h, of in beside])
-    ended = sized(_finished(promise, truncated, leading - _HOPELESS), leading)
+    top = _leading(sets, leading - SEARCH.searched, n, SEARCH.leading_sets)
+    beside = _with_residual_discrepancies(guesses, top)
+    truncated = truncated_fits([guesses.start_from(h, of, 1) for h, of in beside])
+    ended = sized(_finished(promise, truncated, leading - SEARCH.hopeless), leading)
     everything = _best_of_each([*unlisted, *sets, *ended])
     by_name: dict[str, tuple[Fit, ...]] = {}
     for found in everything:
@@ -380,14 +349,15 @@ def sets_and_unlisted(
     return by_name
 
 
-def far_out(found: Fit, effect: int, priors: Priors) -> bool:
+def unusually_large(found: Fit, effect: int, priors: Priors) -> bool:
     """Whether an effect of a fit, by its place, is larger than its usual priors say."""
     sizes = found.psi[found.forward.phi_slices[effect]]
-    return any(abs(t - p.loc) > _FAR_OUT * p.scale for t, p in zip(sizes, priors.free, strict=True))
+    far = SEARCH.unusually_large
+    return any(abs(t - p.loc) > far * p.scale for t, p in zip(sizes, priors.free, strict=True))
 
 
 def _as_sized(
-    guesses: Guesses, usual: Mapping[str, Priors], fits: Sequence[Fit], leading: float
+    guesses: StartingPoints, usual: Mapping[str, Priors], fits: Sequence[Fit], leading: float
 ) -> list[Fit]:
     """Fits, and those in play once more with the priors that their effects' sizes ask for."""
     promise = partial(_promise, usual, guesses.odds)
@@ -395,20 +365,21 @@ def _as_sized(
     asked: list[_Started] = []
     for found in fits:
         h = found.forward.hypothesis
-        if not h.effects or promise([found]) < leading - _SEARCHED:
+        if not h.effects or promise([found]) < leading - SEARCH.searched:
             continue
         large = [
             e.name
             for i, e in enumerate(h.effects)
-            if e.name not in guesses.data.case.context.sizes and far_out(found, i, usual[e.name])
+            if e.name not in guesses.data.case.context.sizes
+            and unusually_large(found, i, usual[e.name])
         ]
         for some in ([], large):
             other = resized(h, usual, some)
             if other not in there:
                 there.add(other)
                 asked.append((other, [found]))
-    truncated = truncated_fits([guesses.begun_jointly(h, of, 1) for h, of in asked])
-    return [*fits, *_finished(promise, truncated, leading - _BEHIND_RESIZED)]
+    truncated = truncated_fits([guesses.start_from(h, of, 1) for h, of in asked])
+    return [*fits, *_finished(promise, truncated, leading - SEARCH.behind_resized)]
 
 
 def _best_of_each(fits: Sequence[Fit]) -> list[Fit]:
@@ -419,35 +390,46 @@ def _best_of_each(fits: Sequence[Fit]) -> list[Fit]:
     return list(best.values())
 
 
-def _with_remainders(guesses: Guesses, causes: Sequence[Fit]) -> list[_Started]:
-    return [(h, [f]) for f in causes for h in with_remainder(guesses.data, f.forward.hypothesis)]
+def _with_residual_discrepancies(guesses: StartingPoints, causes: Sequence[Fit]) -> list[_Started]:
+    return [
+        (h, [f])
+        for f in causes
+        for h in with_residual_discrepancy(guesses.data, f.forward.hypothesis)
+    ]
 
 
 def _pairs(
-    guesses: Guesses, usual: Mapping[str, Priors], single: Sequence[str], best: Mapping[str, Fit],
+    guesses: StartingPoints,
+    usual: Mapping[str, Priors],
+    single: Sequence[str],
+    best: Mapping[str, Fit],
     least: float,
-) -> list[Promise]:  # fmt: skip
+) -> list[CandidateSet]:
     """Guess at pairs that hold one of the best single effects, from either if both are."""
-    found: dict[str, Promise] = {}
+    found: dict[str, CandidateSet] = {}
     for m in _pair_seeds(single, best):
         added = [best[other].forward.hypothesis for other in single if other != m]
-        for p in guesses.beside(best[m].forward.hypothesis, best[m], added, _N_PAIRED):
+        for p in guesses.beside(best[m].forward.hypothesis, best[m], added, SEARCH.guesses_of_pair):
             other = found.get(p.hypothesis.name)
             found[p.hypothesis.name] = p if other is None else other.with_starts_of(p)
     return [p for p in found.values() if _expected(usual, p) > least]
 
 
 def _pair_seeds(single: Sequence[str], best: Mapping[str, Fit]) -> list[str]:
-    return sorted(single, key=lambda m: -best[m].log_evidence)[:_N_PAIR_SEEDS]
+    return sorted(single, key=lambda m: -best[m].log_evidence)[: SEARCH.pair_seeds]
 
 
 def _begun_again(
-    promise: Callable[[Sequence[Fit]], float], pairs: Sequence[Promise],
-    truncated: Sequence[list[Fit]], leading: float,
-) -> list[list[Fit]]:  # fmt: skip
+    promise: Callable[[Sequence[Fit]], float],
+    pairs: Sequence[CandidateSet],
+    truncated: Sequence[list[Fit]],
+    leading: float,
+) -> list[list[Fit]]:
     """Begin the pairs that are in play from more guesses."""
     others = {
-        i: p.parted()[1] for i, p in enumerate(pairs) if promise(truncated[i]) > leading - _SEARCHED
+        i: p.parted()[1]
+        for i, p in enumerate(pairs)
+        if promise(truncated[i]) > leading - SEARCH.searched
     }
     in_play = [i for i, p in others.items() if len(p.starts)]
     more = truncated_fits([others[i].start for i in in_play])
@@ -458,7 +440,7 @@ def _begun_again(
 
 
 def _stepwise(
-    guesses: Guesses,
+    guesses: StartingPoints,
     single: Sequence[Fit],
     usual: Mapping[str, Priors],
     pairs: Sequence[Fit],
@@ -471,13 +453,15 @@ def _stepwise(
     n, promise = guesses.odds, partial(_promise, usual, guesses.odds)
     alone = [f.forward.hypothesis for f in single]
     known, reached, made_from = list(pairs), dict[str, float](), dict[str, float]()
-    _note(reached, [f for f in pairs if promise([f]) > listed - _SEARCHED], promise)
+    _note(reached, [f for f in pairs if promise([f]) > listed - SEARCH.searched], promise)
     while True:
         best = [
             f
-            for size in range(2, _MOST_CAUSES + 1)
-            for f in _leading(_of_size(known, size), listed - _NEAR_BEST, n, _N_SETS)
-            if with_prior(f, n) > made_from.get(f.forward.hypothesis.name, -np.inf) + _BETTER
+            for size in range(2, SEARCH.most_causes + 1)
+            for f in _leading(
+                _of_size(known, size), listed - SEARCH.near_best, n, SEARCH.sets_changed
+            )
+            if with_prior(f, n) > made_from.get(f.forward.hypothesis.name, -np.inf) + SEARCH.better
         ]
         if not best:
             return known[len(pairs) :]
@@ -510,7 +494,9 @@ def _leading(sets: Sequence[Fit], least: float, odds: Odds, count: int) -> list[
     return [f for f in best.values() if with_prior(f, odds) > least][:count]
 
 
-def _exchanged(guesses: Guesses, sets: Sequence[Fit], alone: Sequence[Hypothesis]) -> list[Promise]:
+def _exchanged(
+    guesses: StartingPoints, sets: Sequence[Fit], alone: Sequence[Hypothesis]
+) -> list[CandidateSet]:
     """Guess at sets with one effect of some in the place of another, or with one less."""
     promises = []
     for found in sets:
@@ -523,35 +509,40 @@ def _exchanged(guesses: Guesses, sets: Sequence[Fit], alone: Sequence[Hypothesis
     return promises
 
 
-def _enlarged(guesses: Guesses, sets: Sequence[Fit], alone: Sequence[Hypothesis]) -> list[Promise]:
+def _enlarged(
+    guesses: StartingPoints, sets: Sequence[Fit], alone: Sequence[Hypothesis]
+) -> list[CandidateSet]:
     """Guess at sets of one more effect than some."""
     promises = []
     for found in sets:
         kept = found.forward.hypothesis
         names = {e.name for e in kept.effects}
-        if len(names) < _MOST_CAUSES:
+        if len(names) < SEARCH.most_causes:
             added = [h for h in alone if h.name not in names]
             promises += guesses.beside(kept, found, added)
     return promises
 
 
 def _fitted(
-    usual: Mapping[str, Priors], odds: Odds, promises: Sequence[Promise],
-    reached: Mapping[str, float], listed: float,
-) -> list[Fit]:  # fmt: skip
+    usual: Mapping[str, Priors],
+    odds: Odds,
+    promises: Sequence[CandidateSet],
+    reached: Mapping[str, float],
+    listed: float,
+) -> list[Fit]:
     """Fit the sets that promise most, and again those that do about as well as was reached."""
-    new, again = dict[str, Promise](), dict[str, Promise]()
+    new, again = dict[str, CandidateSet](), dict[str, CandidateSet]()
     expected = [_expected(usual, p) for p in promises]
     for i in np.argsort(expected, kind="stable")[::-1].tolist():
         name = promises[i].hypothesis.name
         if name not in reached:
-            if expected[i] > listed - _UNPROMISING:
+            if expected[i] > listed - SEARCH.unpromising:
                 new.setdefault(name, promises[i])
-        elif expected[i] > max(reached[name] - _AGAIN, listed - _BEHIND_RESIZED):
+        elif expected[i] > max(reached[name] - SEARCH.again, listed - SEARCH.behind_resized):
             again.setdefault(name, promises[i])
-    chosen = [*list(new.values())[:_N_FITTED], *list(again.values())[:_N_AGAIN]]
+    chosen = [*list(new.values())[: SEARCH.fitted], *list(again.values())[: SEARCH.fitted_again]]
     truncated = truncated_fits([p.start for p in chosen])
-    return _finished(partial(_promise, usual, odds), truncated, listed - _BEHIND)
+    return _finished(partial(_promise, usual, odds), truncated, listed - SEARCH.behind)
 
 
 def _finished(
@@ -570,7 +561,7 @@ def _promise(usual: Mapping[str, Priors], odds: Odds, begun: Sequence[Fit]) -> f
     return max(with_prior(f, odds) + _as_usual(usual, f.forward, f.psi) for f in begun)
 
 
-def _expected(usual: Mapping[str, Priors], promise: Promise) -> float:
+def _expected(usual: Mapping[str, Priors], promise: CandidateSet) -> float:
     """What a promise expects, by the priors that suit it best."""
     return promise.expected + _as_usual(usual, promise.forward, promise.starts[0])
 
@@ -579,9 +570,11 @@ def _as_usual(usual: Mapping[str, Priors], forward: Forward, psi: Array) -> floa
     """Log of how much more probable parameters are if effects have usual priors where they suit."""
     gained = 0.0
     for e, wide, part in zip(
-        forward.hypothesis.effects, forward.hypothesis.effect_priors, forward.phi_slices,
+        forward.hypothesis.effects,
+        forward.hypothesis.effect_priors,
+        forward.phi_slices,
         strict=True,
-    ):  # fmt: skip
+    ):
         if wide != usual[e.name]:
             denser = usual[e.name].log_prob(psi[None, part]) - wide.log_prob(psi[None, part])
             gained += max(float(denser[0] - np.log(WIDE)), 0.0)

@@ -22,10 +22,11 @@ from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 from calib.gap.campaigns import Campaigns, campaigns
 from calib.gap.case import read_case
+from calib.gap.constants import MIN_EFFECT_SIZE_IN_PAIR
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import Hypothesis, joined, shifts, singles, split_testable, unknowns
 from calib.gap.noise import Noise, noise_conditions
-from calib.gap.odds import RELEVANT_IN_PAIR, sizes
+from calib.gap.odds import sizes
 from calib.gap.ranking import calibrate_lab
 from calib.inference.random import generator
 from calib.models.base import Array
@@ -33,7 +34,6 @@ from calib.models.base import Array
 # The gap that is drawn is the one asked for within this ratio.
 SIZE_RATIO = 1.25
 _DRAWS, _TRIES = 4000, 40
-_DIGITS = 6  # as many as a careful reading has; more than the noise needs
 
 
 def well_specified_case(
@@ -113,7 +113,7 @@ def _table(table: Table, outputs: dict[str, Array]) -> str:
     """The table as it was written, with other readings."""
     cells = dict(zip(table.header, zip(*table.text, strict=True), strict=True))
     for name, values in outputs.items():
-        cells[OUTPUTS[name]] = tuple(f"{value:.{_DIGITS}g}" for value in values)
+        cells[OUTPUTS[name]] = tuple(f"{value:.6g}" for value in values)
     rows = zip(*cells.values(), strict=True)
     return "\n".join(",".join(row) for row in (tuple(cells), *rows)) + "\n"
 
@@ -173,7 +173,7 @@ def draw_from_hypothesis(
         size = _gap(forward, psi, noise)
         fits = (size < gap_over_noise * SIZE_RATIO) & (size > gap_over_noise / SIZE_RATIO)
         if "+" in truth:
-            fits &= (sizes(forward, noise, psi) >= RELEVANT_IN_PAIR).all(axis=1)
+            fits &= (sizes(forward, noise, psi) >= MIN_EFFECT_SIZE_IN_PAIR).all(axis=1)
         if fits.any():
             first = int(np.argmax(fits))
             return Draw(forward, psi[[first]], float(size[first]))

@@ -13,6 +13,7 @@ from calib.gap.corrected import Shrink
 from calib.gap.diagnose import Diagnosis, assumed
 from calib.gap.effects import EFFECTS
 from calib.gap.fit import Fit
+from calib.gap.hypotheses import parameter_units
 from calib.gap.identifiability import NextMeasurement
 from calib.gap.mixture import UNLISTED, Included, Region
 from calib.models import get_model
@@ -50,7 +51,7 @@ def gap_evidence(found: Diagnosis) -> GapEvidence:
     """Collect what the verdict is made from."""
     ranking = found.ranking
     best = found.ranking.order[0]
-    design = ranking.isolability
+    design = ranking.identifiability
     case_context = found.data.case.context
     alike = [
         short_name(b if a == best else a) for a, b in design.alike if best in (a, b)
@@ -77,7 +78,7 @@ def gap_evidence(found: Diagnosis) -> GapEvidence:
         smallest=max(design.detectable.values(), default=float("nan")),
         look=where_to_look(found) if best == "unknown" else "",
         causes=[_cause(found, n, c) for n, c in found.inclusion.causes.items()],
-        remainder=_cause(found, UNLISTED, found.inclusion.remainder),
+        remainder=_cause(found, UNLISTED, found.inclusion.residual_discrepancy),
         remainder_where=_remainder_where(found),
         untested=_untested(found),
         assumed=_assumed(found, ranking.best(best)),
@@ -95,7 +96,7 @@ def _put_in(found: Diagnosis) -> list[str]:
     singles = [
         group[0].forward.hypothesis for n, group in found.ranking.fits.items() if n in context.sizes
     ]
-    said = context.words(singles)
+    said = context.words(parameter_units(singles))
     return said + [
         f"{short_name(n)} cannot be tested here ({unable[n]}), so that nothing follows from it"
         for n in dict.fromkeys([*context.suspected, *context.sizes])

@@ -17,8 +17,8 @@ from calib.data.files import plain_number
 from calib.data.quantities import QUANTITIES, Quantity, columns_of, convert
 from calib.data.table import accepted_headers, parse_header
 from calib.errors import CalibError, meant
+from calib.gap.constants import FORM_ERROR
 from calib.gap.effects import EFFECTS, Effect
-from calib.gap.forward import FORM_ERROR
 from calib.gap.hypotheses import read_effect_priors
 from calib.inference.prior_files import default_priors, read_priors
 from calib.inference.priors import Prior

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from calib.gap.case import Size
+from calib.gap.case import CaseFile
 
 type Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 type Interval = Annotated[list[float], Field(min_length=2, max_length=2)]
@@ -19,26 +19,6 @@ type Count = Annotated[int, Field(ge=0)]
 
 class _Exactly(BaseModel):
     model_config = ConfigDict(extra="forbid", protected_namespaces=())
-
-
-class Context(_Exactly):
-    """What is known of a case besides the data."""
-
-    suspected: dict[str, Annotated[float, Field(gt=0.0, lt=1.0)]] = {}
-    excluded: list[str] = []
-    sizes: dict[str, dict[str, Size]] = {}
-
-
-class Case(_Exactly):
-    """`case.toml` of a case folder."""
-
-    calibration: str
-    field: str
-    predict: str | None = None
-    models: Annotated[dict[str, str], Field(min_length=1)]
-    priors: dict[str, str] = {}
-    covariates: dict[str, Literal["number", "category"] | list[str]] = {}
-    context: Context | None = None
 
 
 class _Spread(_Exactly):
@@ -284,6 +264,6 @@ class Campaign(_Exactly):
 
 
 RESULTS = {
-    "case": Case, "diagnosis": Diagnosis, "summary": Summary, "sbc": Sbc, "check": Check,
+    "case": CaseFile, "diagnosis": Diagnosis, "summary": Summary, "sbc": Sbc, "check": Check,
     "campaign": Campaign,
 }  # fmt: skip

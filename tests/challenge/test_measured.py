@@ -15,7 +15,7 @@ import pytest
 from calib.batch.plugins import run_file
 from calib.data import read_table
 from calib.errors import CalibError
-from calib.gap.campaigns import MIN_FIELD_ROWS
+from calib.gap.constants import MIN_FIELD_ROWS
 from calib.gap.effects import EFFECTS
 from calib.inference.problem import build_problem
 from calib.models import MODELS

@@ -17,7 +17,6 @@ import pytest
 from pydantic import BaseModel, ValidationError
 
 from calib.data.quantities import QUANTITIES
-from calib.gap import case
 from calib.gap.effects import View
 from calib.inference.record import RunRecord
 from calib.models import example_csv
@@ -110,10 +109,6 @@ def test_what_a_check_and_a_campaign_say_is_as_their_schemas_say(run: Calib) -> 
     (task,) = campaign.tasks
     checked = json.loads(run("check", f"c/results/{task}/run", "--quick", "--json").out)
     assert MODELS_OF["check"].model_validate(checked).verdict == "same"
-
-
-def test_the_cases_schema_has_the_keys_that_are_read() -> None:
-    assert set(MODELS_OF["case"].model_fields) == set(case._KEYS)
 
 
 def test_the_keys_of_a_run_are_told() -> None:

@@ -11,7 +11,12 @@ from pydantic import ValidationError
 from calib.errors import CalibError
 from calib.gap.case import Context, Size, read_case, read_context
 from calib.gap.diagnose import diagnose_once
-from calib.gap.hypotheses import Hypothesis
+from calib.gap.hypotheses import (
+    Hypothesis,
+    parameter_units,
+    unusual_sizes,
+    with_known_size,
+)
 from calib.gap.odds import Odds
 from calib.inference.priors import Prior, Priors
 from calib.report.gap_evidence import gap_evidence
@@ -20,7 +25,7 @@ from tests.gap.cases import CHOICE, PULL_ONLY, make_case, write_case
 
 
 def test_suspicion_multiplies_the_odds_of_every_explanation_with_the_cause():
-    plain, given = Odds.of(10, Context()), Odds.of(10, Context({"lug_thrust": 0.5}))
+    plain, given = Odds.of(10, Context()), Odds.of(10, Context(suspected={"lug_thrust": 0.5}))
     for name in ("lug_thrust", "lug_thrust+rate_effect", "lug_thrust+unknown"):
         gained = given.ln_prior(name) - plain.ln_prior(name)
         # From 0.036 to even odds.
@@ -110,7 +115,7 @@ def test_a_context_is_read_from_the_case(tmp_path):
         toml + '\n[context]\nsuspected = {lug_thrust = 0.5}\nexcluded = ["sensor_drift"]\n'
     )
     context = read_case(folder).context
-    assert context == Context({"lug_thrust": 0.5}, ("sensor_drift",))
+    assert context == Context(suspected={"lug_thrust": 0.5}, excluded=("sensor_drift",))
     assert context.words() == ["lug thrust suspected (0.5)", "sensor drift excluded"]
     assert read_context(None, "") == Context()
 
@@ -120,7 +125,11 @@ KNOWN = {"lug_thrust": {"thrust": Size(mean=-0.2, sd=0.05)}}
 
 @pytest.mark.parametrize(
     "context",
-    [Context({"lug_thrust": 0.5}), Context(excluded=("lug_thrust",)), Context(sizes=KNOWN)],
+    [
+        Context(suspected={"lug_thrust": 0.5}),
+        Context(excluded=("lug_thrust",)),
+        Context(sizes=KNOWN),
+    ],
 )
 def test_any_of_its_parts_makes_a_context(context):
     assert context
@@ -136,7 +145,7 @@ def digging(*, known) -> Hypothesis:
         Prior("digging", "1", "why", "who", "", False, 0.2, 0.0),
     )
     single = Hypothesis("lug_thrust", effect_priors=(Priors(entries, "text", "source"),))
-    return Context(sizes={"lug_thrust": known}).sized(single)
+    return with_known_size(single, Context(sizes={"lug_thrust": known}))
 
 
 def test_what_is_known_of_a_size_replaces_that_and_nothing_else():
@@ -158,7 +167,7 @@ def test_what_is_known_of_a_size_replaces_that_and_nothing_else():
 
 def test_of_other_effects_nothing_is_known():
     single = Hypothesis("rate_effect", effect_priors=(Priors(()),))
-    assert Context(sizes=KNOWN).sized(single) is single
+    assert with_known_size(single, Context(sizes=KNOWN)) is single
 
 
 def known_lugs(**known: Size) -> tuple[Context, Hypothesis]:
@@ -180,10 +189,10 @@ def known_lugs(**known: Size) -> tuple[Context, Hypothesis]:
 )
 def test_a_size_in_another_unit_is_told(name, mean, sd, words):
     context, single = known_lugs(**{name: Size(mean=mean, sd=sd)})
-    said = context.unusual([single])
+    said = unusual_sizes([single], context)
     assert len(said) == bool(words)
     assert words in "".join(said)
-    assert context.unusual([]) == []
+    assert unusual_sizes([], context) == []
 
 
 def test_sizes_that_were_put_in_have_their_units():
@@ -191,8 +200,12 @@ def test_sizes_that_were_put_in_have_their_units():
     (entry,) = (p for p in single.effect_priors[0].entries if p.name == "thrust")
     priors = Priors((replace(entry, unit="kN"),), "text", "source")
     in_kn = replace(single, effect_priors=(priors,))
-    assert context.words([in_kn]) == ["lug thrust: thrust 0.4 ± 0.1 kN"]
-    assert context.words([single]) == context.words() == ["lug thrust: thrust 0.4 ± 0.1"]
+    assert context.words(parameter_units([in_kn])) == ["lug thrust: thrust 0.4 ± 0.1 kN"]
+    assert (
+        context.words(parameter_units([single]))
+        == context.words()
+        == ["lug thrust: thrust 0.4 ± 0.1"]
+    )
 
 
 def test_what_is_put_in_and_cannot_be_tested_is_said_to_change_nothing():

@@ -198,24 +198,6 @@ def test_without_declared_columns_and_priors_none_are_read(made, tmp_path):
     assert found.causes == ()
 
 
-def test_causes_are_those_of_any_hypothesis(made):
-    assert made.causes == ("rate_effect", "sensor_drift", "parameter_shift", "unknown")
-
-
-@pytest.mark.parametrize(
-    ("probability", "faults"),
-    [
-        ((0.5, 0.5), ["sensor_drift"]), ((0.25, 0.75), []), ((0.49, 0.51), []),
-        ((0.125, 0.375, 0.375, 0.125), ["sensor_drift"]), ((0.3, 0.3, 0.19, 0.21), []),
-    ],
-)  # fmt: skip
-def test_a_fault_is_as_probable_as_not_over_all_hypotheses(made, probability, faults):
-    """Of what acts in the first and the third; an effect of the soil is no fault."""
-    first, other, *_ = made.mixture.fits
-    fits = (first, other, first, other)[: len(probability)]
-    assert Corrected(Mixture(made.data, fits, probability, 1), made.lab_mode).faults == faults
-
-
 def damaged(folder, change):
     path = folder / "corrected.json"
     content = json.loads(path.read_text())
@@ -267,23 +249,6 @@ def test_what_the_coordinates_of_a_shift_mean_is_the_files(kept, factor):
     told = pytest.raises(CalibError, match="no longer predicts")
     with told if factor > 1.0 else nullcontext():
         load_corrected(kept)
-
-
-def test_where_it_had_no_value_it_may_have_none_again(made, tmp_path):
-    """As of a simulator that is asked far outside what it is made for."""
-    fit = fit_of(made.data, Hypothesis("none"), made.lab_mode)
-    psi = fit.psi.copy()
-    psi[fit.forward.theta_slices["rut_depth"]] = np.nan
-    nowhere = Mixture(made.data, (replace(fit, psi=psi),), (1.0,), 1)
-    save_corrected(Corrected(nowhere, made.lab_mode), tmp_path)
-    (again,) = load_corrected(tmp_path).mixture.fits
-    np.testing.assert_array_equal(again.psi, psi)
-
-
-def test_numbers_are_short(kept):
-    fit = json.loads((kept / "corrected.json").read_text())["fits"][0]
-    for value in [*fit["sample"][0], *fit["field"]["drawbar_pull"]]:
-        assert value == float(f"{value:.12g}")
 
 
 def test_a_drift_is_predicted_as_at_the_end_of_the_campaign(made):
@@ -341,21 +306,6 @@ def test_a_prediction_is_laid_out_by_output(made):
             np.testing.assert_allclose(
                 found[f"{column}_after_{end}"], truth.quantile(truth.measured[o.name], q)
             )
-
-
-def test_conditions_outside_are_of_numbers_that_are_given(made):
-    """Neither outputs nor categories; of what the table has."""
-    field = made.data.case.field
-    n = len(field)
-    text = tuple(("Berg", f"{t!r}") for t in np.r_[99.0, -5.0, np.full(n - 2, 20.0)].tolist())
-    columns = {
-        "slip_ratio": np.r_[0.9, np.full(n - 1, 0.3)], "drawbar_pull_kn": np.full(n, 80.0),
-        "speed_m_s": np.r_[0.3, 50.0, 0.001, np.full(n - 3, 0.3)],
-    }  # fmt: skip
-    table = replace(field, columns=columns, header=("operator", "tyre_temperature_c"), text=text)
-    assert conditions_outside(made, table) == {
-        "slip_ratio": 1, "speed_m_s": 2, "tyre_temperature_c": 2,
-    }  # fmt: skip
 
 
 def test_missing_covariates_are_named(saved):

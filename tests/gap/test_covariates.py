@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.gap.campaigns import Covariates, campaigns, columns_over, other_conditions
+from calib.gap.campaigns import ScaledConditions, campaigns, columns_over, other_conditions
 from tests.gap.cases import PULL_ONLY, make_case, table_without
 
 
 def test_both_campaigns_span_the_scale():
     data = campaigns(make_case(models=PULL_ONLY))
-    slip = Covariates(data).scaled(data.view, "slip_ratio")
+    slip = ScaledConditions(data).scaled(data.view, "slip_ratio")
     both = np.concatenate([data.case.lab["slip_ratio"], data.case.field["slip_ratio"]])
     expected = 2.0 * (data.case.field["slip_ratio"] - both.min()) / np.ptp(both) - 1.0
     np.testing.assert_allclose(slip, expected, atol=1e-12)
@@ -24,7 +24,7 @@ def test_speeds_are_even_in_ratios():
     both = np.concatenate([data.view.conditions["speed_m_s"], data.case.lab["speed_m_s"]])
     middle = np.full(27, np.sqrt(both.min() * both.max()))
     view = replace(data.view, conditions={**data.view.conditions, "speed_m_s": middle})
-    scaled = Covariates(data).over(view, "speed")
+    scaled = ScaledConditions(data).over(view, "speed")
     np.testing.assert_allclose(scaled, 0.0, atol=1e-12)
 
 
@@ -33,7 +33,7 @@ def test_far_beyond_both_campaigns_it_ends():
     for slip, end in ((9.0, 1.5), (-9.0, -1.5)):
         beyond = {**data.view.conditions, "slip_ratio": np.full(27, slip)}
         view = replace(data.view, conditions=beyond)
-        np.testing.assert_array_equal(Covariates(data).scaled(view, "slip_ratio"), end)
+        np.testing.assert_array_equal(ScaledConditions(data).scaled(view, "slip_ratio"), end)
 
 
 @pytest.mark.parametrize("name", ["speed_m_s", "no_such_column"])
@@ -43,7 +43,7 @@ def test_what_is_lacking_or_constant_has_no_scale(name: str):
     lab = replace(data.case.lab, columns={**data.case.lab.columns, "speed_m_s": np.full(30, 1.0)})
     view = replace(data.view, conditions=columns)
     alike = replace(data, view=view, case=replace(data.case, lab=lab))
-    assert Covariates(alike).scaled(view, name) is None
+    assert ScaledConditions(alike).scaled(view, name) is None
 
 
 def test_pressure_on_the_ground_stands_for_that_in_the_tyre():
@@ -53,7 +53,7 @@ def test_pressure_on_the_ground_stands_for_that_in_the_tyre():
         field=table_without(case.field, "inflation_pressure_psi"),
     )  # fmt: skip
     data = campaigns(without)
-    covariates = Covariates(data)
+    covariates = ScaledConditions(data)
     ground = covariates.scaled(data.view, "average_ground_pressure_kpa")
     assert ground is not None
     np.testing.assert_array_equal(covariates.over(data.view, "pressure"), ground)
@@ -62,7 +62,7 @@ def test_pressure_on_the_ground_stands_for_that_in_the_tyre():
 def test_each_view_has_its_own_values_on_the_scale():
     """The field's are kept for the next who asks, those of other conditions are not."""
     data = campaigns(make_case(models=PULL_ONLY))
-    covariates = Covariates(data)
+    covariates = ScaledConditions(data)
     slip = data.case.field["slip_ratio"]
     field = covariates.scaled(data.view, "slip_ratio")
     for shift in (0.01, 0.05):
@@ -90,7 +90,7 @@ def test_each_view_has_its_own_values_on_the_scale():
 def test_what_differs_by_rounding_alone_is_constant(values, varies):
     data = campaigns(make_case(models=PULL_ONLY))
     columns = {**data.view.conditions, "tyre_temperature_c": np.resize(values, 27)}
-    scaled = Covariates(replace(data, view=replace(data.view, conditions=columns)))
+    scaled = ScaledConditions(replace(data, view=replace(data.view, conditions=columns)))
     found = scaled.over(scaled.data.view, "tyre_temperature_c")
     if not varies:
         assert found is None

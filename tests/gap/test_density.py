@@ -7,14 +7,15 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal, norm
 
+from calib.gap.constants import KAPPA, RHO
 from calib.gap.fit import Fit, fit
 from calib.gap.forward import Forward
 from calib.gap.gauss_newton import Residuals
-from calib.gap.hypotheses import Hypothesis, singles, unknowns, with_remainder
+from calib.gap.hypotheses import Hypothesis, singles, unknowns
 from calib.gap.importance import Density, refine
-from calib.gap.noise import KAPPA, RHO, Noise, ln_prior
+from calib.gap.noise import Noise, ln_prior
 from tests.gap.cases import CHOICE, campaigns_of
-from tests.gap.fits import SIGMA, averaged_log_joint, lifted, log_joint
+from tests.gap.fits import SIGMA, averaged_log_joint, lifted
 
 
 def fitted(hypothesis: Hypothesis) -> Fit:
@@ -108,25 +109,6 @@ def test_a_free_discrepancy_is_integrated_out(free):
         assert value == pytest.approx(closed_form(free, which, at), abs=1e-4)
 
 
-def test_what_was_integrated_out_is_drawn_given_the_rest(free):
-    density, rng = Density(free), np.random.default_rng(2)
-    which = np.delete(np.arange(free.psi.size), density.drawn)
-    _, psi = density.evaluate(near(free, density, 1), rng)
-    many, ln_factor = density.completed(np.tile(psi, (4000, 1)), rng)
-    np.testing.assert_array_equal(many[:, density.drawn], np.tile(psi[0, density.drawn], (4000, 1)))
-    at_zero, basis = linear_model(free, which, psi[0])
-    noise = Residuals(free.forward.data, free.forward).sds(free.noise)
-    prior = [free.forward.priors.free[i].scale ** -2.0 for i in which]
-    covariance = np.linalg.inv((basis / noise[:, None] ** 2).T @ basis + np.diag(prior))
-    mean = covariance @ basis.T @ (at_zero / noise**2)
-    sd = np.sqrt(np.diag(covariance))
-    np.testing.assert_allclose((many[:, which].mean(axis=0) - mean) / sd, 0.0, atol=0.08)
-    np.testing.assert_allclose(many[:, which].std(axis=0) / sd, 1.0, atol=0.06)
-    # With the factor each has the density that is averaged over the noise.
-    expected = averaged_log_joint(free, many[:5]) - log_joint(free, many[:5])
-    np.testing.assert_allclose(ln_factor[:5], expected, atol=1e-6)
-
-
 def test_form_errors_of_an_effect_that_is_added_are_weighted_as_if_integrated_out(lugs):
     """Whatever is drawn of them, as long as the factor stays positive."""
     density = Density(lugs)
@@ -145,39 +127,6 @@ def test_form_errors_of_an_effect_that_is_added_are_weighted_as_if_integrated_ou
         assert value.std() < 0.6  # of their mean, 0.01
         expected = averaged_closed_form(lugs, forms, whole)
         assert logsumexp(value) - np.log(value.size) == pytest.approx(expected, abs=0.01)
-
-
-def test_an_effect_with_something_besides_has_both():
-    """Unbiased: form errors by a fine grid, the discrepancy in closed form at each."""
-    data = campaigns_of("force_offset")
-    drift = single("sensor_drift")
-    found = fitted(next(h for h in with_remainder(data, drift) if h.smooth_over == "slip"))
-    density = Density(found)
-    at = density.mode[None]
-    estimates, _ = density.evaluate(np.repeat(at, 2000, axis=0), np.random.default_rng(5))
-    parts = [part for (part,) in found.forward.form_slices.values()]
-    (form,) = np.concatenate([np.arange(part.start, part.stop) for part in parts])
-    smooth = np.arange(found.forward.smooth.start, found.forward.smooth.stop)
-    assert sorted([*density.drawn.tolist(), form, *smooth.tolist()]) == list(range(found.psi.size))
-    grid = np.linspace(-1.2, 1.2, 97)
-    values = []
-    for c in grid:
-        whole = found.psi.copy()
-        whole[density.drawn], whole[form] = at[0], c
-        values.append(closed_form(found, smooth, whole))
-    expected = logsumexp(values) + np.log(grid[1] - grid[0])
-    assert logsumexp(estimates) - np.log(2000.0) == pytest.approx(expected, abs=0.02)
-
-
-def test_outside_the_priors_bounds_there_is_no_density(lugs):
-    density = Density(lugs)
-    drawn = near(lugs, density, 2)
-    lower = [lugs.forward.priors.free[i].lower for i in density.drawn]
-    bounded = int(np.flatnonzero(np.isfinite(lower))[0])
-    drawn[1, bounded] = lower[bounded] - 0.1
-    found, _ = density.evaluate(drawn, np.random.default_rng(6))
-    assert np.isfinite(found[0])
-    assert found[1] == -np.inf
 
 
 def test_without_anything_linear_it_is_the_joint_density():

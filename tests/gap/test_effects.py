@@ -417,11 +417,11 @@ def test_instruments_are_told_from_wheel_and_soil():
 
 
 def test_an_effect_of_which_nothing_is_said_does_nothing(view):
-    class Idle(Effect):
+    class LeftOut(Effect):
         name = "idle"
         outputs = ("pull",)
 
-    effect, phi, location = Idle(), np.ones((K, 2)), np.ones((K, 20))
+    effect, phi, location = LeftOut(), np.ones((K, 2)), np.ones((K, 20))
     given = by_role(view)
     assert effect.on_conditions(phi, "pull", given, view) is given
     assert effect.on_output(phi, "pull", location, view) is location

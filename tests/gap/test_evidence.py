@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal, norm
 
-import calib.gap.fit as module
 from calib.gap.campaigns import Campaigns
-from calib.gap.fit import Fit, _bounds_correction, _near, _within, finished, fit
+from calib.gap.constants import KAPPA, RHO
+from calib.gap.fit import Fit, fit
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import Hypothesis
-from calib.gap.importance import Density, _Pool, refine
-from calib.gap.noise import KAPPA, RHO, Noise, ln_prior
+from calib.gap.importance import refine
+from calib.gap.noise import Noise, ln_prior
 from calib.inference.priors import Prior
-from calib.inference.sampling.proposal import StudentT
-from tests.gap.fits import averaged_log_joint, lifted, straight_line
+from tests.gap.fits import lifted, straight_line
 
 
 def design_of(data: Campaigns) -> np.ndarray:
@@ -102,119 +100,10 @@ def test_of_a_bounded_parameter_the_evidence_is_the_mass_inside(lower: float):
         assert mean[0] + 2.0 * np.sqrt(covariance[0, 0]) < lower
 
 
-def test_of_two_modes_the_more_probable_is_kept():
-    """Also where it is the other that promised more before both had been climbed."""
-
-    def at(psi: float, evidence: float) -> Fit:
-        return Fit(None, np.array([psi]), np.eye(1), {}, evidence, 0.0, {})  # type: ignore[arg-type]
-
-    begun = [at(0.0, -3.0), at(9.0, -1.0), at(9.5, -2.0), at(20.0, -30.0)]
-    climbed: list[list[float]] = []
-
-    def climb(begun):
-        climbed.extend([float(f.psi[0]) for f in fits] for fits in begun)
-        return [[replace(f, log_evidence=-float(f.psi[0])) for f in fits] for fits in begun]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "full_fits", climb)
-        (found,) = finished([begun])
-    # Of two on the way to one mode the better is climbed; one far less probable is not.
-    assert climbed == [[9.0, 0.0]]
-    assert found.psi[0] == 0.0
-
-
 def at(psi, evidence: float = 0.0, covariance=None) -> Fit:
     psi = np.atleast_1d(np.asarray(psi, dtype=float))
     covariance = np.eye(psi.size) if covariance is None else covariance
     return Fit(None, psi, covariance, {}, evidence, 0.0, {})  # type: ignore[arg-type]
-
-
-def test_two_fits_are_near_within_one_and_a_half_sds_of_the_better_in_every_coordinate():
-    other = at([0.0, 0.0], covariance=np.diag([1.0, 0.04]))
-    assert _near(at([1.49, 0.29]), other)
-    assert not _near(at([1.51, 0.0]), other)
-    assert not _near(at([0.0, 0.31]), other)
-    assert not _near(at([-1.51, 0.31]), other)
-
-
-def test_fits_are_climbed_from_within_six_nats_of_the_best(monkeypatch):
-    climbed: list[float] = []
-
-    def climb(begun):
-        climbed.extend(f.log_evidence for fits in begun for f in fits)
-        return begun
-
-    monkeypatch.setattr(module, "full_fits", climb)
-    begun = [at(9.0 * i, e) for i, e in enumerate((-8.0, -2.0, -8.01, -3.0))]
-    (found,) = finished([begun])
-    assert climbed == [-2.0, -3.0, -8.0]
-    assert found.log_evidence == -2.0
-    # Where none has an evidence one is climbed all the same.
-    climbed.clear()
-    finished([[at(0.0, -np.inf), at(9.0, -np.inf)]])
-    assert len(climbed) >= 1
-    climbed.clear()
-    finished([[at(0.0, np.nan), at(9.0, np.nan)]])
-    assert len(climbed) == 1
-
-
-def test_no_bounded_coordinate_is_wider_than_half_its_range():
-    problem = SimpleNamespace(lower=np.array([0.0, 0.0, -np.inf]), upper=np.array([2.0, 2.0, 1.0]))
-    covariance = np.array([[4.0, 0.6, 1.0], [0.6, 0.25, 0.2], [1.0, 0.2, 9.0]])
-    found = _within(problem, covariance)
-    shrunk = np.array([0.5, 1.0, 1.0])
-    np.testing.assert_allclose(found, shrunk[:, None] * covariance * shrunk)
-
-
-@pytest.mark.parametrize("held", [False, True])
-@pytest.mark.parametrize("side", ["lower", "upper", "both"])
-def test_the_mass_inside_the_bounds_is_that_of_the_normal_whose_slope_is_that_at_the_bound(
-    held, side
-):
-    """Of exp(-g x - x^2 / 2 sd^2) beside that of exp(-x^2 / 2 sd^2) over all numbers."""
-    sd, slope = 0.5, 0.8 if held else 0.0
-    down, up = -1.0 if side != "upper" else -np.inf, 0.7 if side != "lower" else np.inf
-    if held:  # at a bound, downhill beyond it
-        down, up = (0.0, up) if side != "upper" else (down, 0.0)
-        slope = slope if side != "upper" else -slope
-    psi = np.array([3.0, 5.0])
-    problem = SimpleNamespace(
-        lower=np.array([-np.inf, 5.0 + down]), upper=np.array([np.inf, 5.0 + up]),
-        blocked=lambda at, direction: np.array([[False, held]]),
-    )  # fmt: skip
-    found = _bounds_correction(problem, psi, np.array([7.0, slope]), np.diag([2.0, sd**2]))
-    x = np.linspace(max(down, -12 * sd), min(up, 12 * sd), 200_001)
-    y = np.exp(-slope * x - 0.5 * (x / sd) ** 2) / (sd * np.sqrt(2.0 * np.pi))
-    assert found == pytest.approx(np.log(np.trapezoid(y, x)), abs=1e-6)
-
-
-def test_draws_of_all_rounds_weigh_as_from_the_mixture_of_their_proposals():
-    """Worked out again by the densities; no weight is above root k times their mean."""
-    data = straight_line(1)
-    forward = Forward(data, Hypothesis("none"), {"drawbar_pull": 0.04})
-    found = fit(forward, np.array([0.0, 0.5]), {"drawbar_pull": Noise(0.04)})
-    root = np.linalg.cholesky(found.covariance)
-    proposals = [
-        StudentT(found.psi + root[:, 0], 0.5 * root, 6.0), StudentT(found.psi, 2.0 * root, 6.0)
-    ]  # fmt: skip
-    pool, sizes = _Pool(Density(found)), (30, 60)
-    rng = np.random.default_rng(2)
-    for proposal, size in zip(proposals, sizes, strict=True):
-        pool.add(proposal, rng, size)
-    assert pool.draws.shape == (90, 2)
-    density = [np.log(n) + q.log_prob(pool.draws) for n, q in zip(sizes, proposals, strict=True)]
-    plain = averaged_log_joint(found, pool.draws) - logsumexp(density, axis=0)
-    most = logsumexp(plain) - np.log(90.0) + 0.5 * np.log(90.0)
-    np.testing.assert_allclose(pool.log_weight(), np.minimum(plain, most))
-    # One that carries all weight is cut down, one without any value has none.
-    pool._log_joint[4] += 50.0
-    pool._log_joint[7] = np.nan
-    weights = pool.log_weight()
-    others = np.delete(weights, [4, 7])
-    plain = pool._log_joint - logsumexp(density, axis=0)
-    assert weights[7] == -np.inf
-    assert weights[4] == pytest.approx(plain[4] - 0.5 * np.log(90.0))
-    np.testing.assert_allclose(others, np.delete(plain, [4, 7]))
 
 
 def _normal(data: Campaigns, noise: Noise) -> tuple[np.ndarray, np.ndarray]:

@@ -187,7 +187,10 @@ def test_every_number_is_the_one_that_was_found():
             "interval": list(s.interval), "noise_floor": s.noise_floor,
         }  # fmt: skip
     assert d["shrink"]
-    for name, cause in [*found.inclusion.causes.items(), ("", found.inclusion.remainder)]:
+    for name, cause in [
+        *found.inclusion.causes.items(),
+        ("", found.inclusion.residual_discrepancy),
+    ]:
         part = d["inclusion"].get(name, d["remainder"])
         told = (part["probability"], part["share"], tuple(part["share_interval"]))
         assert told == (cause.probability, cause.share, cause.share_interval)

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
-from scipy.integrate import quad
 from scipy.optimize import minimize
 from scipy.special import logsumexp
 from scipy.stats import multivariate_t
@@ -16,12 +14,13 @@ from scipy.stats import multivariate_t
 from calib.data import table_from_arrays
 from calib.gap.campaigns import Campaigns, campaigns
 from calib.gap.case import Case
+from calib.gap.constants import KAPPA, RHO
 from calib.gap.effects import EFFECTS
-from calib.gap.fit import Fit, _ln_mass, fit
+from calib.gap.fit import Fit, fit
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import Hypothesis, effect_priors
 from calib.gap.importance import refine
-from calib.gap.noise import KAPPA, RHO, Noise, ln_prior
+from calib.gap.noise import Noise, ln_prior
 from tests.gap.cases import PULL_ONLY, make_case
 from tests.gap.fits import averaged_log_joint
 
@@ -127,16 +126,6 @@ def test_residuals_are_standardised(data, fitted):
     assert np.sqrt(np.mean(np.square(residual))) == pytest.approx(1.0, abs=0.4)
 
 
-def test_draws_stay_inside_the_priors(fitted):
-    draws = fitted.draws(np.random.default_rng(0), 4000)
-    for column, p in zip(draws.T, fitted.forward.priors.free, strict=True):
-        assert column.min() >= p.lower
-        assert column.max() <= p.upper
-    i = fitted.forward.phi_slices[0].start
-    # 4000 draws: the sd of their sd is 1.1 %.
-    assert draws[:, i].std() == pytest.approx(np.sqrt(fitted.covariance[i, i]), rel=0.06)
-
-
 def noisy_again(case: Case, sds: Sequence[np.ndarray], seed: int) -> Campaigns:
     """The case's two tables without noise, and noise of these sds."""
     rng = np.random.default_rng(seed)
@@ -174,20 +163,3 @@ def test_noise_of_a_soft_tyre_is_seen(kappa: float):
     assert found.rho == 0.0
     # 180 readings less a dozen parameters: 5.5 %.
     assert found.sigma == pytest.approx(0.02, rel=0.17)
-
-
-@pytest.mark.parametrize(
-    ("low", "high"), [(-1.0, 2.0), (-0.5, 0.1), (8.0, 9.0), (-9.0, -8.0), (20.0, np.inf),
-                      (-np.inf, -20.0), (-np.inf, np.inf), (3.0, 3.0001)],
-)  # fmt: skip
-def test_the_mass_between_two_ends_is_exact_in_either_tail(low, high):
-    """Against the integral of the density over its value at the end that is nearer the middle."""
-    nearest = min(max(0.0, low), high)
-    ends = (max(low, -40.0), min(high, 40.0))
-    inside = sorted({*ends, nearest, *np.clip([nearest - 0.5, nearest + 0.5], *ends)})
-    total = sum(
-        quad(lambda x: np.exp(0.5 * (nearest**2 - x**2)), a, b, epsabs=0.0, epsrel=1e-11)[0]
-        for a, b in pairwise(inside)
-    )
-    expected = np.log(total) - 0.5 * nearest**2 - 0.5 * np.log(2.0 * np.pi)
-    assert _ln_mass(low, high) == pytest.approx(expected, abs=1e-9)

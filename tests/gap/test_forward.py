@@ -12,7 +12,7 @@ from calib.data.quantities import role_of
 from calib.gap.campaigns import campaigns
 from calib.gap.discrepancy import shift_map
 from calib.gap.effects import EFFECTS, Effect
-from calib.gap.forward import Departed, Forward, fields_of_all
+from calib.gap.forward import FieldPrediction, Forward, fields_of_all
 from calib.gap.hypotheses import (
     Hypothesis,
     effect_priors,
@@ -21,7 +21,7 @@ from calib.gap.hypotheses import (
     singles,
     split_testable,
     unknowns,
-    with_remainder,
+    with_residual_discrepancy,
 )
 from calib.inference.priors import Prior, Priors
 from tests.gap.cases import NOISE, campaigns_of, make_case
@@ -307,7 +307,7 @@ def test_a_form_error_is_of_the_functions_it_is_named_for(data, effect, beyond):
 
 def test_without_a_cause_the_others_stay(data):
     """Of a shift with something besides: either alone, and neither is the simulator."""
-    for h in with_remainder(data, shifts(data)[0]):
+    for h in with_residual_discrepancy(data, shifts(data)[0]):
         forward = Forward(data, h, SIGMA, {o.name: centre_of(o) for o in data.outputs})
         rng = np.random.default_rng(2)
         psi = centre(forward)
@@ -345,7 +345,7 @@ def test_what_is_added_by_conditions_serves_for_any_form_errors(data, names):
     for part in (s for o in forward.form_slices.values() for s in o):
         other[:, part] = 0.3 * rng.standard_normal((5, part.stop - part.start))
     plain = forward.simulator(psi, data.view)
-    departed = Departed([(forward, psi)], data.view, plain)
+    departed = FieldPrediction([(forward, psi)], data.view, plain)
     for form in (psi, other):
         found, expected = departed.at([form]), forward.departed(form, data.view, plain)
         for o in data.names:

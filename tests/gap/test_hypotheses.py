@@ -11,19 +11,18 @@ import pytest
 from calib.data import table_from_arrays
 from calib.gap.campaigns import campaigns
 from calib.gap.case import Case
+from calib.gap.constants import COVERED, SHIFTS
 from calib.gap.diagnose import diagnose, diagnose_once
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import (
-    COVERED,
-    SHIFTS,
     Hypothesis,
-    aside,
     covered,
     dependences,
     effect_priors,
     inseparable,
     joined,
+    prior_share,
     readings,
     resized,
     shifts,
@@ -31,8 +30,8 @@ from calib.gap.hypotheses import (
     split_testable,
     unknowns,
     wider,
-    with_own,
-    with_remainder,
+    with_case_effects,
+    with_residual_discrepancy,
 )
 from calib.report.gap_sizes import size_sentences
 from tests.gap.cases import MODELS, NOISE, PULL_ONLY, campaigns_of, make_case, table_without
@@ -56,7 +55,7 @@ def of_low_pressure(data) -> list[Hypothesis]:
 def test_shares_of_a_name_sum_to_one(data):
     assert sum(h.share for h in unknowns(data)) == pytest.approx(1.0)
     (single,) = singles(data, {"force_offset": EFFECTS["force_offset"]})
-    beside = with_remainder(data, single)
+    beside = with_residual_discrepancy(data, single)
     assert sum(h.share for h in beside) == pytest.approx(1.0)
     assert {h.name for h in beside} == {"force_offset+unknown"}
 
@@ -352,14 +351,14 @@ def test_of_a_density_its_probes_are_what_it_may_change_with():
 
 def test_beside_a_cause_there_is_little_of_every_shape(data):
     (offset,) = singles(data, {"force_offset": EFFECTS["force_offset"]})
-    beside = with_remainder(data, replace(offset, share=0.5))
+    beside = with_residual_discrepancy(data, replace(offset, share=0.5))
     shapes = [(h.smooth_over, h.smooth, h.smooth_outputs, h.share) for h in beside]
     assert sorted(shapes) == [
         ("all", 1.5, BOTH, 0.1), ("all", 5.0, BOTH, 0.1), ("level", 1.5, BOTH, 0.1),
         ("slip", 1.5, BOTH, 0.1), ("slip", 5.0, BOTH, 0.1),
     ]  # fmt: skip
     assert {h.effects for h in beside} == {offset.effects}
-    probed = with_remainder(campaigns(density_campaigns()), replace(offset, share=0.3))
+    probed = with_residual_discrepancy(campaigns(density_campaigns()), replace(offset, share=0.3))
     assert [(h.smooth_over, h.smooth) for h in probed] == [
         ("level", 1.5), ("all", 1.5), ("all", 5.0),
     ]  # fmt: skip
@@ -513,14 +512,14 @@ def test_over_the_runs_a_reading_changes_in_the_shapes_of_the_drawbar_cells(data
 
 def test_what_a_case_brings_with_it_gives_way_to_an_effect_of_its_name(data):
     mine = EFFECTS["rut_rebound"]
-    found = with_own(data, {"rut_depth_step": mine})
+    found = with_case_effects(data, {"rut_depth_step": mine})
     assert found["rut_depth_step"] is mine
     assert {"rut_depth_drift", *dependences(data)} <= set(found)
 
 
 def test_what_is_tried_beside_listed_effects_is_less_probable_than_they(data):
-    everything = with_own(data, EFFECTS)
-    shares = {name: aside(effect, EFFECTS) for name, effect in everything.items()}
+    everything = with_case_effects(data, EFFECTS)
+    shares = {name: prior_share(effect, EFFECTS) for name, effect in everything.items()}
     assert {shares[name] for name in EFFECTS} == {None}
     assert shares["rut_depth_drift"] == shares["rut_depth_step"] == 0.2
     assert shares["depends_on_speed"] == 0.02

@@ -7,23 +7,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.optimize import brentq
-from scipy.special import logsumexp
 from scipy.stats import norm
 
 from calib.data import table_from_arrays
 from calib.gap.campaigns import campaigns
+from calib.gap.constants import MIN_EFFECT_SIZE, PRIOR
 from calib.gap.effects import EFFECTS
-from calib.gap.hypotheses import LN_PRIOR, singles
-from calib.gap.identifiability import ALIKE, isolability, smallest_shown
+from calib.gap.hypotheses import singles
+from calib.gap.identifiability import identifiability, smallest_shown
 from calib.gap.noise import Noise
-from calib.gap.odds import RELEVANT
 from calib.gap.ranking import rank
 from calib.inference.sampling.mode import prior_widths
 from tests.gap.cases import CHOICE, campaigns_of, make_case, ranking_of
 
 
 def test_shares_sizes_and_cosines_are_in_their_ranges():
-    design = ranking_of(None).isolability
+    design = ranking_of(None).identifiability
     names = set(design.absorbed)
     assert names == set(design.detectable)
     # Beside the effects only what the pull may depend on that no effect of these is about.
@@ -31,15 +30,10 @@ def test_shares_sizes_and_cosines_are_in_their_ranges():
     for name in names:
         assert 0.0 <= design.absorbed[name] <= 1.0
         assert 0.05 < design.detectable[name] < 20.0
-    for (a, b), cosine in design.likeness.items():
+    for (a, b), cosine in design.cosine_similarity.items():
         assert a < b
         assert -1.0 - 1e-9 <= cosine <= 1.0 + 1e-9
-    assert len(design.likeness) == len(names) * (len(names) - 1) // 2
-
-
-def test_alike_are_the_pairs_above_the_limit():
-    design = ranking_of(None).isolability
-    assert set(design.alike) == {p for p, v in design.likeness.items() if v >= ALIKE}
+    assert len(design.cosine_similarity) == len(names) * (len(names) - 1) // 2
 
 
 def test_field_outcomes_do_not_matter():
@@ -48,7 +42,7 @@ def test_field_outcomes_do_not_matter():
     columns["drawbar_pull_kn"] = columns["drawbar_pull_kn"][::-1] + 3.0
     other = replace(case, field=table_from_arrays(columns))
     few = {n: EFFECTS[n] for n in ("force_offset", "lug_thrust")}
-    a, b = (rank(campaigns(c), 1, effects=few).isolability for c in (case, other))
+    a, b = (rank(campaigns(c), 1, effects=few).identifiability for c in (case, other))
     assert a == b
 
 
@@ -57,8 +51,8 @@ def test_two_names_of_one_effect_are_alike():
     effect = EFFECTS["force_offset"]
     one, two = singles(data, {"force_offset": effect})[0], singles(data, {"same": effect})[0]
     mode = {"drawbar_pull": ranking_of_pull().lab_mode["drawbar_pull"]}
-    design = isolability(data, [one, two], mode, {"drawbar_pull": Noise(0.03, 0.0)}, 1)
-    assert design.likeness["force_offset", "same"] == pytest.approx(1.0)
+    design = identifiability(data, [one, two], mode, {"drawbar_pull": Noise(0.03, 0.0)}, 1)
+    assert design.cosine_similarity["force_offset", "same"] == pytest.approx(1.0)
     assert design.absorbed["same"] == pytest.approx(design.absorbed["force_offset"])
 
 
@@ -72,26 +66,11 @@ def test_what_parameters_can_imitate_is_absorbed():
     data = campaigns_of(None, "pull")
     few = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift")}
     mode = {"drawbar_pull": ranking_of_pull().lab_mode["drawbar_pull"]}
-    design = isolability(data, singles(data, few), mode, {"drawbar_pull": Noise(0.03, 0.0)}, 1)
+    design = identifiability(data, singles(data, few), mode, {"drawbar_pull": Noise(0.03, 0.0)}, 1)
     assert design.absorbed["force_offset"] > design.absorbed["sensor_drift"]
     # With a laboratory that leaves more noise, everything is harder to see.
-    noisy = isolability(data, singles(data, few), mode, {"drawbar_pull": Noise(0.3, 0.0)}, 1)
+    noisy = identifiability(data, singles(data, few), mode, {"drawbar_pull": Noise(0.3, 0.0)}, 1)
     assert noisy.absorbed["force_offset"] != design.absorbed["force_offset"]
-
-
-def test_far_below_the_noise_the_prior_leaves_nothing_to_absorb_with():
-    """Whatever the size of a signature in noise sds, the share of it is in range and continuous."""
-    data = campaigns_of(None, "pull")
-    few = singles(data, {n: EFFECTS[n] for n in ("force_offset", "sensor_drift")})
-    mode = {"drawbar_pull": ranking_of_pull().lab_mode["drawbar_pull"]}
-    shares = [
-        isolability(data, few, mode, {"drawbar_pull": Noise(sd, 0.0)}, 1).absorbed
-        for sd in (3.0, 30.0, 300.0)
-    ]
-    for name in ("force_offset", "sensor_drift"):
-        first, second, third = (share[name] for share in shares)
-        assert first > second > third >= 0.0
-        assert third < 0.01
 
 
 def test_more_rows_show_smaller_effects():
@@ -100,7 +79,7 @@ def test_more_rows_show_smaller_effects():
     sizes = []
     for n_field in (12, 48):
         data = campaigns(make_case(models=models, n_field=n_field))
-        sizes.append(rank(data, 1, effects=few).isolability.detectable)
+        sizes.append(rank(data, 1, effects=few).identifiability.detectable)
     for name in few:
         ratio = sizes[0][name] / sizes[1][name]
         # Four times the rows halve the sd, but not the size from which on an effect counts.
@@ -108,27 +87,11 @@ def test_more_rows_show_smaller_effects():
     assert np.isfinite(list(sizes[1].values())).all()
 
 
-@pytest.mark.parametrize("sd", [0.05, 0.3, 1.5])
-def test_the_smallest_size_shown_is_the_first_estimate_that_counts(sd: float):
-    sizes = np.random.default_rng(2).gamma(2.0, 2.0, 300)
-    relevant = sizes[sizes >= RELEVANT]
-    largest = relevant.max() + 4.0 * sd
-
-    def ln_factor(estimate: float) -> float:
-        exponent = (2.0 * estimate * relevant - relevant**2) / (2.0 * sd**2)
-        return float(logsumexp(exponent) - np.log(relevant.size))
-
-    for ln_odds in (1.0, 4.0, ln_factor(largest) - 1e-6):
-        first = smallest_shown(sizes, sd, ln_odds) - norm.ppf(0.8) * sd
-        assert ln_factor(first - 1e-3) < ln_odds < ln_factor(first + 1e-3)
-    assert smallest_shown(sizes, sd, ln_factor(largest) + 1e-6) == np.inf
-
-
 def test_the_smallest_size_shown_is_that_of_the_bayes_factor():
     """Against a fine sum over a uniform prior from the relevant size on, and its limits."""
     prior = np.linspace(0.0, 10.0, 10_001)
     sd, ln_odds = 0.25, 5.0
-    sizes = prior[prior >= RELEVANT]
+    sizes = prior[prior >= MIN_EFFECT_SIZE]
 
     def ln_factor(estimate: float) -> float:
         with_effect = norm.pdf(estimate, sizes, sd).mean()
@@ -137,8 +100,8 @@ def test_the_smallest_size_shown_is_that_of_the_bayes_factor():
     threshold = brentq(lambda t: ln_factor(t) - ln_odds, 0.1, 3.0)
     found = smallest_shown(prior, sd, ln_odds)
     assert found == pytest.approx(threshold + norm.ppf(0.8) * sd, abs=0.01)
-    assert smallest_shown(prior, 1e-3, ln_odds) == pytest.approx(0.5 * RELEVANT, abs=0.02)
-    assert smallest_shown(prior[prior < RELEVANT], sd, ln_odds) == np.inf
+    assert smallest_shown(prior, 1e-3, ln_odds) == pytest.approx(0.5 * MIN_EFFECT_SIZE, abs=0.02)
+    assert smallest_shown(prior[prior < MIN_EFFECT_SIZE], sd, ln_odds) == np.inf
 
 
 def test_absorbed_is_what_the_calibrated_parameters_can_take_up():
@@ -172,11 +135,11 @@ def test_absorbed_is_what_the_calibrated_parameters_can_take_up():
     one = np.ones(o.rows.size)
     left = one @ np.linalg.solve(c, one)
     single = singles(data, {"force_offset": EFFECTS["force_offset"]})
-    design = isolability(data, single, {o.name: mode}, {o.name: Noise(sigma, 0.0)}, 1)
+    design = identifiability(data, single, {o.name: mode}, {o.name: Noise(sigma, 0.0)}, 1)
     assert design.absorbed["force_offset"] == pytest.approx(1.0 - left / one.size, rel=0.01)
     # Smallest size: its estimate has the sd 1/sqrt(left), its size is |d|/sigma.
     prior = np.abs(single[0].effect_priors[0].sample(np.random.default_rng(3), 4096)[:, 0]) / sigma
-    ln_odds = np.log(10.0) + LN_PRIOR["none"] - LN_PRIOR["single"]
+    ln_odds = np.log(10.0) + np.log(PRIOR["none"] / PRIOR["single"])
     expected = smallest_shown(prior, left**-0.5, ln_odds)
     # Of one thousand draws against four thousand others.
     assert design.detectable["force_offset"] == pytest.approx(expected, rel=0.05)

@@ -141,7 +141,7 @@ def test_what_an_effect_declares_wrongly_is_named_when_it_is_registered(attribut
         ("        return phi[:, 0]\n", "an array of float64 of shape (8,)"),
         ("        pass\n", "on_output for drawbar_pull returned NoneType"),
         ('        return location + float("nan")\n', "no finite number for drawbar_pull"),
-        ("        location += phi[:, :1]\n        return location\n", "location it is given"),
+        ("        location += phi[:, :1]\n        return location\n", "mean response it is given"),
         ("        return location\n", "it changes nothing on this case"),
         (
             RETURN + "\n    def on_conditions(self, phi, output, conditions, view):\n"
@@ -280,7 +280,7 @@ MOST = (
         ("np.maximum(location, 0.0)", "np.nan * location", "most returned nan"),
         ("np.maximum(location, 0.0)", "view.of('wind')", "does not run: KeyError"),
         ("return np.maximum(location, 0.0)", "location *= 0.0\n        return location",
-         "most changes the location"),
+         "most changes the mean response"),
         ("most(self, phi, output, location, view)", "most(self, location)", "does not run: Type"),
         ('"the pull"', '"  "', "at_most words"),
         ('"the pull"', "True", "at_most words"),

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from calib.gap.hypotheses import Hypothesis, singles
-from calib.gap.mixture import Mixture, Truth, _thinned, mixture
+from calib.gap.mixture import Mixture, Truth
 from calib.gap.noise import Noise
 from tests.gap.cases import CHOICE, campaigns_of
 from tests.gap.fits import SIGMA, fit_at
@@ -26,24 +25,6 @@ def offset_fit(data, offset: float):
     psi = found.psi.copy()
     psi[found.forward.phi_slices[0]] = offset
     return replace(found, psi=psi)
-
-
-def test_each_hypothesis_weighs_what_it_is_probable_and_has_draws_enough(data):
-    none, offset = fit_at(data, Hypothesis("none")), offset_fit(data, 0.3)
-    truth = Mixture(data, (none, offset), (0.75, 0.03), 1).at(data.view)
-    # 1200 draws in proportion, a hundred at least.
-    assert truth.weight.shape == (1000,)
-    assert truth.weight.sum() == pytest.approx(1.0)
-    assert truth.weight[:900].sum() == pytest.approx(0.75 / 0.78)
-    assert np.ptp(truth.weight[:900]) == np.ptp(truth.weight[900:]) == 0.0
-    gap = truth.truth["drawbar_pull"] - truth.simulator["drawbar_pull"]
-    np.testing.assert_allclose(gap[:900], 0.0, atol=1e-12)
-    np.testing.assert_allclose(gap[900:], 0.3)
-    np.testing.assert_allclose(truth.truth["rut_depth"], truth.simulator["rut_depth"])
-    plain = none.forward.simulator(none.psi[None], data.view)
-    np.testing.assert_allclose(truth.simulator["drawbar_pull"][0], plain["drawbar_pull"][0])
-    np.testing.assert_allclose(truth.simulator["rut_depth"][0], np.exp(plain["rut_depth"][0]))
-    np.testing.assert_allclose(truth.means["drawbar_pull"], plain["drawbar_pull"][0] + 0.3 / 26.0)
 
 
 def test_readings_have_noise_in_their_own_unit_and_relative_noise_of_ruts(data):
@@ -94,37 +75,3 @@ def test_a_quantile_is_the_first_value_that_so_much_weight_does_not_exceed():
     assert truth.quantile(values, 0.55).tolist() == [2.0, 3.0]
     assert truth.quantile(values, 0.56).tolist() == [3.0, 3.0]
     assert truth.quantile(values, 1.0).tolist() == [4.0, 4.0]
-
-
-def ranked(**groups):
-    """A ranking of probabilities, and scores of the variants of each name."""
-    fits = {
-        name: [SimpleNamespace(name=f"{name} {i}", sample=None) for i in range(len(scores))]
-        for name, (_, scores) in groups.items()
-    }
-    return SimpleNamespace(
-        order=list(groups), probability={name: p for name, (p, _) in groups.items()},
-        fits=fits, scores={name: s for name, (_, s) in groups.items()},
-    )  # fmt: skip
-
-
-def test_variants_share_their_names_probability_by_their_scores(data):
-    """Of 3 to 1; one of 1 to 25 is left out, as is a hypothesis of one in a thousand."""
-    scores = -900.0 + np.log([3.0, 1.0, 0.1])
-    found = mixture(data, ranked(a=(0.8, scores), b=(0.199, [-5.0]), c=(0.001, [-9.0])), 7)
-    assert [f.name for f in found.fits] == ["a 0", "a 1", "b 0"]
-    weights = np.array([0.8 * 3.0 / 4.1, 0.8 / 4.1, 0.199])
-    assert found.probability == pytest.approx(tuple(weights / weights.sum()))
-    assert found.seed == 7
-    # The first is there however improbable: someone has to be.
-    for p_a, p_b, names in ((0.001, 0.001, ["a 0"]), (0.998, 0.002, ["a 0", "b 0"])):
-        found = mixture(data, ranked(a=(p_a, [0.0]), b=(p_b, [0.0])), 1)
-        assert [f.name for f in found.fits] == names
-
-
-def test_of_many_draws_every_third_is_kept(data):
-    many = np.arange(3000.0).reshape(1500, 2)
-    for sample, kept in ((many, many[::3]), (many[:500], many[:500]), (many[:70], many[:70])):
-        found = _thinned(replace(offset_fit(data, 0.1), sample=sample))
-        np.testing.assert_array_equal(found.sample, kept)
-    assert _thinned(offset_fit(data, 0.1)).sample is None

@@ -10,9 +10,8 @@ from scipy.stats import norm
 
 from calib.data import table_from_arrays
 from calib.gap.campaigns import campaigns
+from calib.gap.constants import KAPPA, RHO
 from calib.gap.noise import (
-    KAPPA,
-    RHO,
     Noise,
     NoiseConditions,
     ln_averaged,

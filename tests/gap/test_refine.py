@@ -13,7 +13,7 @@ from calib.gap.effects import EFFECTS
 from calib.gap.fit import fit
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import Hypothesis, effect_priors
-from calib.gap.importance import _ln_mean, refine
+from calib.gap.importance import refine
 from calib.gap.noise import Noise
 from calib.gap.ranking import rank
 from calib.he2019.gaps import paper_gaps
@@ -89,23 +89,3 @@ def test_a_hopeless_normal_is_left_as_it_is():
     hopeless = replace(found, psi=found.psi + 40.0 * np.sqrt(np.diag(found.covariance)))
     tight = replace(hopeless, covariance=found.covariance * 1e-6)
     assert refine(tight, 1).sample is None
-
-
-def test_draws_come_from_the_sample():
-    found = refine(fitted("slip_zero_shift", {"rut_depth": "modified_bekker"}), 1)
-    drawn = found.draws(np.random.default_rng(1), 50)
-    assert all((found.sample == row).all(axis=1).any() for row in drawn)
-
-
-def test_a_mean_that_few_draws_carry_is_told_by_two_cumulants():
-    """Of a lognormal both are right; that of the draws is their mean while many carry it."""
-    rng = np.random.default_rng(7)
-    few = rng.normal(-2.0, 4.0, (40, 1500))
-    told = np.array([_ln_mean(ln) for ln in few])
-    assert abs(told.mean() - 6.0) < 0.15
-    assert told.std() < 0.4
-    by_draws = np.log(np.exp(few).mean(axis=1))
-    assert abs(by_draws.mean() - 6.0) > 0.5
-    many = rng.normal(-2.0, 0.7, 1500)
-    assert _ln_mean(many) == pytest.approx(np.log(np.exp(many).mean()))
-    assert _ln_mean(np.zeros(1500)) == 0.0

@@ -11,8 +11,9 @@ import pytest
 from calib.errors import CalibError
 from calib.gap import discrepancy as module
 from calib.gap.campaigns import campaigns
+from calib.gap.constants import RADIUS_ERROR, SHIFT_DIFFERENCE
 from calib.gap.corrected import Corrected, load_corrected, predict_columns, save_corrected
-from calib.gap.discrepancy import DIFFERENCE, RADIUS_ERROR, ZERO_OF_SLIP, another_soil, quantities
+from calib.gap.discrepancy import ZERO_OF_SLIP, another_soil, quantities
 from calib.gap.effects import EFFECTS
 from calib.gap.fit import Fit
 from calib.gap.forward import Forward
@@ -57,13 +58,13 @@ def test_end_pressures_share_a_shift_and_differ_by_another():
 def test_alone_all_pressures_change_alike_and_shapes_less(data):
     drawn = drawn_shifts(data, "alone")
     sds = {name: float(values.std()) for name, values in drawn.items()}
-    assert sds["D_lo"] == pytest.approx(SIZE * np.hypot(1.0, DIFFERENCE), rel=0.03)
+    assert sds["D_lo"] == pytest.approx(SIZE * np.hypot(1.0, SHIFT_DIFFERENCE), rel=0.03)
     assert sds["z_ref"] == pytest.approx(SIZE, rel=0.03)
     assert sds[ZERO_OF_SLIP] == pytest.approx(SIZE, rel=0.03)
     for name in ("K_bend", "D_bend", "G_bend", "n1"):
-        assert sds[name] == pytest.approx(SIZE * DIFFERENCE, rel=0.03)
+        assert sds[name] == pytest.approx(SIZE * SHIFT_DIFFERENCE, rel=0.03)
     between = float(np.corrcoef(drawn["D_lo"], drawn["D_hi"])[0, 1])
-    d2 = DIFFERENCE**2
+    d2 = SHIFT_DIFFERENCE**2
     assert between == pytest.approx((1.0 - d2) / (1.0 + d2), abs=0.01)
     assert np.corrcoef(drawn["D_lo"], drawn["z_ref"])[0, 1] == pytest.approx(0.0, abs=0.02)
 

@@ -75,16 +75,6 @@ def test_fresh_predictions_have_the_noise_in_their_band(data):
     np.testing.assert_allclose(1.2 - band.lower, 1.645 * 0.05, atol=4 * 0.047 * 0.05)
 
 
-def test_quantiles_follow_the_weights():
-    draws = truth(0.2, 0.01)
-    values = np.arange(2000.0)[:, None] * np.ones((1, 2))
-    assert draws.quantile(values, 0.5) == pytest.approx([999.0, 999.0], abs=1.0)
-    first = np.zeros(2000)
-    first[7] = 1.0
-    single = Truth(draws.simulator, draws.truth, draws.noise, draws.measured, first)
-    assert single.quantile(values, 0.05).tolist() == [7.0, 7.0]
-
-
 def test_the_correction_of_a_large_drift_predicts_new_conditions():
     found = diagnosis_of("sensor_drift")
     s = found.shrink["drawbar_pull"]
@@ -196,42 +186,3 @@ def test_the_lower_end_is_set_farther_off_by_a_quarter_of_its_logarithm():
     assert found.interval[1] == pytest.approx(1.0 - left[2])
     # Errors' medians are of the errors: 1.2 and 0.2.
     assert found.fraction == pytest.approx(1.0 - 0.2 / 1.2)
-
-
-@pytest.mark.parametrize(("gap", "there"), [(0.049, False), (0.051, True)])
-def test_a_gap_of_half_the_noise_is_one(gap, there):
-    assert (shrunk([0.5, 0.5], [gap, gap], before=0.0, after=0.0) is not None) is there
-    # Of the truth's own simulator, wherever the calibrated one is.
-    assert (shrunk([1.0], [1.0 + gap], 0.0, 0.0, simulator=1.0) is not None) is there
-    assert shrunk([1.0], [0.25], before=0.0, after=0.0, noise=0.5) is None
-
-
-@pytest.mark.parametrize(("weight", "there"), [(0.5, True), (0.499, False)])
-def test_a_gap_is_told_where_it_is_at_least_as_probable_as_not(weight, there):
-    found = shrunk([weight, 1.0 - weight], [0.3, 0.0], before=0.0, after=0.3)
-    assert (found is not None) is there
-
-
-def test_what_makes_it_worse_has_a_negative_fraction_within_its_interval():
-    found = shrunk([0.5, 0.5], [0.3, 0.32], before=0.0, after=1.0)
-    assert found.fraction == pytest.approx(1.0 - 0.7 / 0.3) or found.fraction < -1.0
-    assert found.interval[0] <= found.fraction <= found.interval[1]
-
-
-def test_one_that_had_no_error_did_not_shrink_to_anything_infinite():
-    """A gap of the simulator as it is in the field, none of the calibrated one, which had none."""
-    found = shrunk([1.0], [1.0], before=1.0, after=1.0, simulator=0.0)
-    assert found.rmse_before == found.rmse_after == 0.0
-    assert found.fraction == 1.0
-    assert found.interval == pytest.approx((1.0, 1.0))
-
-
-def test_the_noise_floor_is_the_median_of_the_draws_own():
-    name, sd = "drawbar_pull", np.array([[0.3, 0.3], [0.1, 0.1], [0.2, 0.2]])
-    true = np.ones((3, 2))
-    draws = Truth({name: 0.0 * true}, {name: true}, {name: sd}, {name: true}, np.full(3, 1 / 3))
-    data = SimpleNamespace(outputs=(SimpleNamespace(name=name),))
-    found = shrink(data, draws, {name: np.zeros(2)}, {name: np.ones(2)})[name]
-    assert found.noise_floor == pytest.approx(0.2)
-    predicted = predict_new(draws, {name: np.zeros(2)})[name]
-    np.testing.assert_allclose(predicted.after, 1.0)

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from calib.gap.campaigns import Simulated, campaigns
+from calib.gap.campaigns import CaseSimulator, campaigns
 from tests.gap.cases import campaigns_of
 from tests.gap.test_hypotheses import density_campaigns
 
@@ -20,7 +20,7 @@ def data():
     return campaigns_of(None)
 
 
-def middle(simulated: Simulated, k: int = 2) -> tuple[np.ndarray, np.ndarray]:
+def middle(simulated: CaseSimulator, k: int = 2) -> tuple[np.ndarray, np.ndarray]:
     t = np.tile([p.loc for p in simulated.priors], (k, 1))
     t += (
         0.2
@@ -52,15 +52,15 @@ def test_beyond_the_pressures_of_both_campaigns_it_goes_on_straight(data):
     )
     # One pressure only is no range to go on from, and the field's own lie inside.
     for other in (
-        Simulated(data.outputs[0], data.view, (30.0, 30.0)),
-        Simulated(data.outputs[0], data.view, (20.0, 25.0)),
+        CaseSimulator(data.outputs[0], data.view, (30.0, 30.0)),
+        CaseSimulator(data.outputs[0], data.view, (20.0, 25.0)),
     ):
         conditions = {**other.field, PSI: data.view.conditions[PSI]}
         np.testing.assert_array_equal(
             other.predict_beyond(t, misfit, conditions), other.predict(t, misfit, conditions)
         )
     wide = {**data.simulated["drawbar_pull"].field, PSI: pressure}
-    only = Simulated(data.outputs[0], data.view, (30.0, 30.0))
+    only = CaseSimulator(data.outputs[0], data.view, (30.0, 30.0))
     np.testing.assert_array_equal(
         only.predict_beyond(t, misfit, wide), only.predict(t, misfit, wide)
     )
@@ -133,7 +133,7 @@ def test_an_emulators_error_is_told_by_the_axes_that_are_more_than_it_neglects(d
     emulator = SimpleNamespace(
         typical_variances=variances, curves_at=lambda at: curves[at["row"]], negligible=0.02
     )
-    simulated = Simulated.__new__(Simulated)
+    simulated = CaseSimulator.__new__(CaseSimulator)
     simulated._emulator, simulated._ranges = emulator, ()
     simulated._mix = simulated._error_of({"row": np.arange(30)})
     simulated.n_errors = simulated._mix.shape[1]

@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import groupby
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from calib.gap.mixture import (
-    RowGap,
     Truth,
-    _region,
-    _stretches,
     conditions_to_search,
     mixture,
     regions,
@@ -103,20 +97,6 @@ def test_no_gap_no_region(data):
     assert regions(data, truth, row_gaps(data, truth)) == ()
 
 
-def test_weights_of_draws_count(data):
-    truth = truth_with(np.full(27, 0.3))
-    weight = np.zeros(500)
-    weight[0] = 1.0
-    none = Truth(
-        truth.simulator,
-        {"drawbar_pull": np.vstack([np.ones((1, 27)), truth.truth["drawbar_pull"][1:]])},
-        truth.noise, truth.measured, weight,
-    )  # fmt: skip
-    (found,) = row_gaps(data, none)
-    np.testing.assert_allclose(found.gap, 0.0)
-    np.testing.assert_allclose(found.probability, 0.0)
-
-
 def test_a_null_campaign_stays_quiet_over_all_rows():
     found = diagnosis_of(None)
     assert found.regions == ()
@@ -171,50 +151,6 @@ def test_a_gap_of_a_field_at_one_condition_is_at_all_its_rows(data):
     assert low == high
 
 
-def stretches_of(values, gap, probability, left, category):
-    """Written out: up to eight groups of distinct values, runs of one probable sign, not too few.
-
-    Of numbers neighbours of one sign are one stretch; of a category each value is its own.
-    """
-    distinct = sorted(set(values))
-    n_groups = len(distinct) if category else min(8, len(distinct))
-    size, longer = divmod(len(distinct), n_groups)
-    groups, at = [], 0
-    for i in range(n_groups):
-        groups.append(distinct[at : at + size + (i < longer)])
-        at += len(groups[-1])
-    told = []
-    for place, group in enumerate(groups):
-        rows = [i for i, v in enumerate(values) if v in group and left[i]]
-        sign = np.sign(sum(gap[i] for i in rows)) if rows else 0.0
-        same = [probability[i] if np.sign(gap[i]) == sign else 0.0 for i in rows]
-        probable = bool(rows) and sum(same) > 0.5 * len(rows)
-        told.append((group, len(rows), sign if probable else 0.0, place if category else 0))
-    found = []
-    for (sign, _), run in groupby(told, key=lambda t: t[2:]):
-        run = list(run)
-        if sign and sum(t[1] for t in run) >= max(2, len(values) // 12):
-            found.append((run[0][0][0], run[-1][0][-1]))
-    return found
-
-
-@given(
-    st.lists(
-        st.tuples(
-            st.integers(0, 20), st.sampled_from([-2.0, -1.0, 1.0, 2.0, 4.0]),
-            st.sampled_from([0.25, 0.5, 0.75, 1.0]), st.booleans(),
-        ),
-        min_size=1, max_size=50,
-    ),
-    st.booleans(),
-)  # fmt: skip
-def test_stretches_are_runs_of_groups_that_probably_have_a_gap_of_one_sign(rows, category):
-    values, gap, probability, left = (np.array(column) for column in zip(*rows, strict=True))
-    row_gap = RowGap("drawbar_pull", np.arange(len(rows)), gap, np.ones(len(rows)), probability)
-    found = _stretches(values.astype(float), row_gap, left, category)
-    assert found == stretches_of(*(c.tolist() for c in (values, gap, probability, left)), category)
-
-
 def of_slips(values, **covariates):
     """One output over slips, and whatever is declared."""
     conditions = {"slip_ratio": np.asarray(values, dtype=float)} | {
@@ -250,37 +186,6 @@ def test_gap_sd_and_probability_are_those_of_weighted_draws():
     np.testing.assert_allclose(found.probability, [0.5, 0.5])
 
 
-def test_of_a_region_draws_count_by_their_weight_and_beyond_the_noise():
-    true = np.array([[0.3] * 4, [0.1] * 4, [0.25] * 4])
-    weight = np.array([0.3, 0.3, 0.4])
-    name, sd = "drawbar_pull", np.full((3, 4), 0.2)
-    truth = Truth({name: np.zeros((3, 4))}, {name: true}, {name: sd}, {name: true}, weight)
-    data = of_slips([0.1, 0.2, 0.3, 0.4])
-    (found,) = regions(data, truth, row_gaps(data, truth))
-    assert found.output == name
-    assert found.conditions == {"slip_ratio": (0.1, 0.4)}
-    assert found.gap == pytest.approx(0.3 * 0.3 + 0.3 * 0.1 + 0.4 * 0.25)
-    assert found.interval == pytest.approx((0.1, 0.3))
-    assert found.probability == pytest.approx(0.7)
-    # At the noise itself a gap is not beyond it.
-    none = Truth({name: np.zeros((3, 4))}, {name: sd}, {name: sd}, {name: sd}, weight)
-    assert regions(data, none, row_gaps(data, none)) == ()
-    even = replace(truth, weight=np.array([0.25, 0.5, 0.25]))
-    # A gap that is no more probable than not is no region, though rows be sure of theirs.
-    assert regions(data, even, (replace(row_gaps(data, truth)[0]),)) == ()
-
-
-def test_regions_come_by_their_gap_times_the_root_of_their_rows_at_most_three():
-    """Two rows a slip: 0.5 root 2, 0.3 root 4, 0.4 root 2; that of 0.2 root 6 is a fourth."""
-    slip = np.repeat(np.arange(1, 9) / 8, 2)
-    gap = np.repeat([0.3, 0.3, -0.5, 0.2, 0.2, 0.2, -0.4, 0.0], 2)
-    data, truth = of_slips(slip), certain(gap)
-    found = regions(data, truth, row_gaps(data, truth))
-    ends = [r.conditions["slip_ratio"] for r in found]
-    assert ends == [(0.375, 0.375), (0.125, 0.25), (0.875, 0.875)]
-    assert [r.gap for r in found] == pytest.approx([-0.5, 0.3, -0.4])
-
-
 def test_of_two_conditions_that_show_the_same_gap_that_of_more_rows_is_told_and_only_it():
     """A surface that is another in four rows, three of them at the three largest slips."""
     slip = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8])
@@ -295,48 +200,3 @@ def test_of_two_conditions_that_show_the_same_gap_that_of_more_rows_is_told_and_
     bare = of_slips(slip)
     (found,) = regions(bare, truth, row_gaps(bare, truth))
     assert found.conditions == {"slip_ratio": (0.6, 0.8)}
-
-
-def test_values_of_a_category_are_no_stretch():
-    kind = np.repeat([0.0, 1.0, 2.0], 3)
-    truth = certain(np.full(9, 0.4))
-    data = of_slips(np.full(9, 0.1), kind=(kind, ("a", "b", "c")))
-    ends = [r.conditions["kind"] for r in regions(data, truth, row_gaps(data, truth))]
-    assert sorted(ends) == [(0.0, 0.0), (1.0, 1.0), (2.0, 2.0)]
-    data = of_slips(np.full(9, 0.1), kind=(kind, ()))
-    (found,) = regions(data, truth, row_gaps(data, truth))
-    assert found.conditions == {"kind": (0.0, 2.0)}
-
-
-def test_conditions_are_searched_in_the_order_in_which_a_reader_looks(data):
-    found = conditions_to_search(data)
-    assert found[:4] == ["slip_ratio", "inflation_pressure_psi", "average_ground_pressure_kpa",
-                         "speed_m_s"]  # fmt: skip
-    assert found[-1] == "run_order"
-    assert "drawbar_pull_kn" not in found
-
-
-@pytest.mark.parametrize(("rows", "fewest"), [(23, 2), (35, 2), (36, 3), (47, 3), (48, 4)])
-def test_a_stretch_has_a_twelfth_of_the_rows_and_two_at_least(rows, fewest):
-    slip = np.concatenate([np.linspace(0.1, 0.4, rows - fewest), np.full(fewest, 0.5)])
-    kind = (slip == 0.5).astype(float)
-    gap = RowGap("drawbar_pull", np.arange(rows), kind, kind, kind)
-    left = np.ones(rows, dtype=bool)
-    assert _stretches(kind, gap, left, True) == [(1.0, 1.0)]
-    left[-1] = False
-    assert _stretches(kind, gap, left, True) == []
-
-
-def test_no_probability_is_above_one_and_a_gap_of_the_noise_itself_is_not_beyond_it():
-    """Weights sum to one but for rounding."""
-    name, one = "drawbar_pull", np.full((1, 4), 0.25)
-    weight = np.array([1.0 + 4e-16])
-    truth = Truth({name: 0.0 * one}, {name: 2.0 * one}, {name: one}, {name: one}, weight)
-    data = of_slips([0.1, 0.2, 0.3, 0.4])
-    gaps = row_gaps(data, truth)
-    assert gaps[0].probability.max() == 1.0
-    (found,) = regions(data, truth, gaps)
-    assert found.probability == 1.0
-    inside = np.ones(4, dtype=bool)
-    assert _region(truth, name, {}, one, one, inside).probability == 0.0
-    assert _region(truth, name, {}, -2.0 * one, one, inside).probability == 1.0

@@ -100,7 +100,7 @@ def diagnosis(name: str) -> Numbers:
         for cause, i in found.inclusion.causes.items()
         if i.probability > _CHANCE
     }
-    numbers["inclusion.unlisted"] = (found.inclusion.remainder.probability, _CHANCE)
+    numbers["inclusion.unlisted"] = (found.inclusion.residual_discrepancy.probability, _CHANCE)
     for output, s in found.shrink.items():
         numbers[f"{output}.fraction"] = (s.fraction, _CHANCE)
         numbers[f"{output}.rmse_before"] = (s.rmse_before, _SEARCHED * abs(s.rmse_before))

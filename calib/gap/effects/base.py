@@ -217,7 +217,7 @@ class Effect:
         """
         return conditions
 
-    def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
+    def on_output(self, phi: Array, output: str, mean_response: Array, view: View) -> Array:
         """Return the prediction with the effect in it, shape (k, n).
 
         Parameters
@@ -225,17 +225,17 @@ class Effect:
         phi : ndarray, shape (k, n_parameters)
         output : str
             Its physical role.
-        location : ndarray, shape (k, n)
+        mean_response : ndarray, shape (k, n)
             On the scale of the response: kN, ln mm, g/cm^3.
         """
-        return location
+        return mean_response
 
-    def most(self, phi: Array, output: str, location: Array, view: View) -> Array:
+    def most(self, phi: Array, output: str, mean_response: Array, view: View) -> Array:
         """Return the most that it can take of an output that it bounds, shape (k, n).
 
         By default all of a positive output. Parameters are those of `on_output`.
         """
-        return np.maximum(location, 0.0)
+        return np.maximum(mean_response, 0.0)
 
     def begun(self, phi: Array, left: Mapping[str, Array], view: View) -> Array:
         """Return guesses from which a fit may begin better than from draws of the prior.

@@ -30,9 +30,6 @@ from calib.gap.effects.base import Effect, Known, View, each
 from calib.gap.effects.instruments import SensorDrift, SensorStep
 from calib.models.base import Array
 
-# A size as a part of the typical reading: as large as the drawbar cell's beside a pull of
-# a fifth of the load.
-_SIZE = 0.25
 _SHAPES = {
     "curvature": 'dist = "lognormal"\nmedian = 1.0\nsd_log = 1.0',
     "half_way": 'dist = "lognormal"\nmedian = 0.5\nsd_log = 1.2',
@@ -60,7 +57,7 @@ class ReadingDrift(SensorDrift):
         self.name, self.outputs, self.device = f"{output}_drift", (role,), f"{word} gauge"
         self.title = f"the {word} reading drifts with run order"
         self.latex = tuple(_of(word, unit, line) for line in SensorDrift.latex)
-        self.priors = _priors(self.name, {"drift": _SIZE * typical}, unit, self.parameters[1:])
+        self.priors = _priors(self.name, {"drift": 0.25 * typical}, unit, self.parameters[1:])
 
 
 class ReadingStep(SensorStep):
@@ -71,7 +68,7 @@ class ReadingStep(SensorStep):
         self.name, self.outputs, self.device = f"{output}_step", (role,), f"{word} gauge"
         self.title = f"the {word} reading jumps at some run, as when a gauge is replaced or slips"
         self.latex = tuple(_of(word, unit, line) for line in SensorStep.latex)
-        self.priors = _priors(self.name, {"jump": _SIZE * typical}, unit, self.parameters[1:])
+        self.priors = _priors(self.name, {"jump": 0.25 * typical}, unit, self.parameters[1:])
 
 
 def _of(word: str, unit: str, line: str) -> str:
@@ -102,8 +99,6 @@ def _priors(name: str, sizes: dict[str, float], unit: str, shapes: tuple[str, ..
 
 
 PREFIX = "depends_on_"
-# Roles of outputs that are forces on the wheel.
-_FORCES = ("pull",)
 _SOURCE = "Wismer & Luth (1973), Brixius (1987): traction over load depends on the load by its "
 _SOURCE += "mobility number only; Bekker (1969): sinkage grows with pressure to the power 1/n"
 
@@ -134,7 +129,7 @@ class DependsOn(Effect):
         self.covariates = (role,)
         self.known = tuple(Known(output, zero_at=(role,)) for output in self.outputs)
         self.of_factors = any(QUANTITIES[c].of_factors for c in columns_of(role))
-        self._additive = tuple(o for o, log in logs.items() if not log and o in _FORCES)
+        self._additive = tuple(o for o, log in logs.items() if not log and o == "pull")
         self.parameters = (
             *(f"{output}_{kind}" for output in logs for kind in ("slope", "bend")),
             *(f"{output}_offset" for output in self._additive),
@@ -148,8 +143,9 @@ class DependsOn(Effect):
             mean, sd = 0.0, {"slope": 0.3, "bend": 0.15, "offset": 0.02}[kind]
             if kind == "slope" and self.of_factors:
                 mean, sd = {
-                    ("load", "pull"): (1.0, 0.3), ("load", "sinkage"): (0.7, 0.5),
-                }.get((self.role, output), (0.0, 0.5))  # fmt: skip
+                    ("load", "pull"): (1.0, 0.3),
+                    ("load", "sinkage"): (0.7, 0.5),
+                }.get((self.role, output), (0.0, 0.5))
             lines.append(
                 f"[parameters.{parameter}]\n"
                 f'dist = "normal"\nmean = {mean}\nsd = {sd}\nunit = "1"\n'
@@ -165,16 +161,16 @@ class DependsOn(Effect):
             return np.log(np.maximum(values, 1e-6) / max(lab, 1e-6))
         return (values - lab) / self.half_range
 
-    def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
+    def on_output(self, phi: Array, output: str, mean_response: Array, view: View) -> Array:
         """Scale the output along the condition."""
         if output not in self.logs:
-            return location
+            return mean_response
         u = self.covariate(view)
         p = dict(zip(self.parameters, each(phi), strict=True))
         change = np.clip(p[f"{output}_slope"] * u + p[f"{output}_bend"] * u**2, -4.0, 4.0)
         if self.logs[output]:
-            return np.asarray(location + change)
-        changed = location * np.exp(change)
+            return np.asarray(mean_response + change)
+        changed = mean_response * np.exp(change)
         if output in self._additive:
             changed = changed + p[f"{output}_offset"] * u * view.load_kn
         return np.asarray(changed)
@@ -213,7 +209,7 @@ class DiffersBy(Effect):
         slug = {j: re.sub(r"\W+", "_", levels[j]).strip("_") or str(j) for j in self._levels}
         if len(set(slug.values())) < len(slug):
             slug = {j: f"{word}_{j}" for j, word in slug.items()}
-        self._additive = tuple(o for o, log in logs.items() if not log and o in _FORCES)
+        self._additive = tuple(o for o, log in logs.items() if not log and o == "pull")
         self.parameters = (
             *(f"{output}_factor_{slug[j]}" for output in logs for j in self._levels),
             *(f"{output}_offset_{slug[j]}" for output in self._additive for j in self._levels),
@@ -227,10 +223,10 @@ class DiffersBy(Effect):
             for p in self.parameters
         )
 
-    def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
+    def on_output(self, phi: Array, output: str, mean_response: Array, view: View) -> Array:
         """Scale the output by the factor of each row's value."""
         if output not in self.logs:
-            return location
+            return mean_response
         code = np.rint(view.of(self.column)).astype(int)
         hot = np.array([code == j for j in self._levels], dtype=float)
         # Factors of each output, then offsets of those that have them, of as many values each.
@@ -238,8 +234,8 @@ class DiffersBy(Effect):
         p = dict(zip(kinds, np.split(phi, len(kinds), axis=1), strict=True))
         change = np.clip(p[f"{output}_factor"] @ hot, -4.0, 4.0)
         if self.logs[output]:
-            return np.asarray(location + change)
-        changed = location * np.exp(change)
+            return np.asarray(mean_response + change)
+        changed = mean_response * np.exp(change)
         if output in self._additive:
             changed = changed + p[f"{output}_offset"] @ hot * view.load_kn
         return np.asarray(changed)

@@ -12,14 +12,8 @@ from calib.models.base import Array
 EARLY = "zero and span, and an early run once more"
 """How a reading that changes over the runs is checked."""
 
-# Part of the campaign over which a step is first taken to happen.
-_WIDE = 0.1
-# Parts of a drift or a step at which it is first taken to have been zeroed.
-_ZEROED = (0.05, 0.95)
 # Curvature and half-way part of drifts: warming up, steady, late, and from one level to another.
 _SHAPES = ((0.8, 0.15), (1.0, 5.0), (3.0, 3.0), (3.0, 0.5), (6.0, 0.25), (6.0, 0.5), (6.0, 0.75))
-# Keeps the size of a drift finite where a guess at its shape has none over the runs.
-_LITTLE = 0.05
 
 
 class _Fault(Effect):
@@ -62,9 +56,9 @@ class ForceOffset(_Fault):
     parameters = ("offset",)
     outputs = ("pull",)
 
-    def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
+    def on_output(self, phi: Array, output: str, mean_response: Array, view: View) -> Array:
         """Add the offset (kN)."""
-        return location + phi if output == "pull" else location
+        return mean_response + phi if output == "pull" else mean_response
 
 
 def _progress(view: View) -> Array:
@@ -81,7 +75,7 @@ def _grown(curvature: Array, half_way: Array, view: View) -> Array:
 def _zero_at(before: Array, size: Array) -> Array:
     """Part of a change at which the gauge was zeroed, by what it read before the change."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.clip(np.nan_to_num(-before / size, nan=0.5), *_ZEROED)
+        return np.clip(np.nan_to_num(-before / size, nan=0.5), 0.05, 0.95)
 
 
 class SensorDrift(_Fault):
@@ -103,13 +97,13 @@ class SensorDrift(_Fault):
     outputs = ("pull",)
     covariates = ("order",)
 
-    def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
+    def on_output(self, phi: Array, output: str, mean_response: Array, view: View) -> Array:
         """Add the drift (from the first run to the last)."""
         if output not in self.outputs:
-            return location
+            return mean_response
         drift, curvature, half_way, zero_at = each(phi)
         grown = _grown(curvature, half_way, view)
-        return np.asarray(location + drift * (grown - zero_at))
+        return np.asarray(mean_response + drift * (grown - zero_at))
 
     def begun(self, phi: Array, left: Mapping[str, Array], view: View) -> Array:
         """Begin with drifts of several shapes, each as large and zeroed where it suits best.
@@ -126,7 +120,7 @@ class SensorDrift(_Fault):
         _, curvature, half_way, _ = each(begun)
         grown, residual = _grown(curvature, half_way, view)[:, known], residual[known]
         mean = grown.mean(axis=1, keepdims=True)
-        begun[:, 0] = (grown - mean) @ residual / (np.square(grown - mean).sum(axis=1) + _LITTLE)
+        begun[:, 0] = (grown - mean) @ residual / (np.square(grown - mean).sum(axis=1) + 0.05)
         begun[:, 3] = _zero_at(residual.mean() - begun[:, 0] * mean[:, 0], begun[:, 0])
         return begun
 
@@ -163,17 +157,17 @@ class SensorStep(_Fault):
         lasts = duration + 1.0 / max(last - first, 1.0)
         return np.asarray(np.clip((_progress(view) - change_point) / lasts + 0.5, 0.0, 1.0))
 
-    def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
+    def on_output(self, phi: Array, output: str, mean_response: Array, view: View) -> Array:
         """Add the jump, and the error before it."""
         if output not in self.outputs:
-            return location
+            return mean_response
         jump, zero_at, *_ = each(phi)
-        return np.asarray(location + jump * (self._beyond(phi, view) - zero_at))
+        return np.asarray(mean_response + jump * (self._beyond(phi, view) - zero_at))
 
     def begun(self, phi: Array, left: Mapping[str, Array], view: View) -> Array:
         """Begin with mean residuals on both sides, and wide: from a sharp step no fit gets away."""
         begun = phi.copy()
-        begun[:, 3] = _WIDE
+        begun[:, 3] = 0.1
         residual = left[self.outputs[0]]
         known = np.isfinite(residual)
         beyond = self._beyond(begun, view)[:, known]

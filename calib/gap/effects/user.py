@@ -23,12 +23,6 @@ from calib.gap.hypotheses import Hypothesis, effect_priors
 from calib.inference.random import generator
 from calib.models.base import Array, check_tuple
 
-# Draws of the priors that an effect is evaluated with.
-_TRIALS = 8
-# Relative, of what an effect may add against its known sign.
-_ROUNDING = 1e-9
-# Likeness from which another attribute is taken for a misspelt one.
-_MISSPELT = 0.8
 _BASE = tuple(name for name in vars(Effect) if not name.startswith("_"))
 _METHODS = tuple(name for name in _BASE if callable(getattr(Effect, name)))
 _TUPLES = ("latex", "parameters", "outputs", "needs", "covariates", "form")
@@ -76,16 +70,21 @@ def check_declared(effect: Effect) -> None:
     if taken is not None and type(taken) is not type(effect):
         whose = "calib's own" if type(taken).__module__.startswith("calib.") else "another file"
         raise CalibError(
-            f"the name is that of an effect of {whose}", where=where,
-            expected=f"any name but {', '.join(EFFECTS)}", hint="give it another name",
-        )  # fmt: skip
+            f"the name is that of an effect of {whose}",
+            where=where,
+            expected=f"any name but {', '.join(EFFECTS)}",
+            hint="give it another name",
+        )
     for attribute in _TUPLES:
         check_tuple(attribute, getattr(effect, attribute), where)
     outputs = {q.physical: q.stem for q in QUANTITIES.values() if q.role == "output"}
     conditions = {q.physical: c for c, q in QUANTITIES.items() if q.role != "output"}
     for attribute, known in (
-        ("outputs", outputs), ("needs", outputs), ("covariates", conditions), ("form", _FORMS),
-    ):  # fmt: skip
+        ("outputs", outputs),
+        ("needs", outputs),
+        ("covariates", conditions),
+        ("form", _FORMS),
+    ):
         for name in getattr(effect, attribute):
             _check_name(name, attribute, known, where)
     for fact in effect.known if isinstance(effect.known, tuple) else [effect.known]:
@@ -104,12 +103,13 @@ def _check_known(effect: Effect, fact: object, conditions: Mapping[str, str], wh
         or fact.at_most.isspace()
     ):
         raise CalibError(
-            f"known has {fact!r}", where=where,
+            f"known has {fact!r}",
+            where=where,
             expected=f"a tuple of Known(output, sign, ...), output one of "
             f"{', '.join(effect.outputs)}, sign -1, 0 or 1, at_most words",
             hint='write known = (Known("pull", -1, zero_at=("slip",)),), with the comma; '
             'at_most="the pull that there is"',
-        )  # fmt: skip
+        )
     for attribute in ("zero_at", "grows_with"):
         check_tuple(attribute, getattr(fact, attribute), where)
         for name in getattr(fact, attribute):
@@ -119,37 +119,44 @@ def _check_known(effect: Effect, fact: object, conditions: Mapping[str, str], wh
 def _check_name(name: str, attribute: str, known: Collection[str], where: str) -> None:
     if name not in known:
         raise CalibError(
-            f"unknown name {name!r} in {attribute}", where=where,
-            expected=", ".join(known), hint=_role_of_column(name) or meant(name, known),
-        )  # fmt: skip
+            f"unknown name {name!r} in {attribute}",
+            where=where,
+            expected=", ".join(known),
+            hint=_role_of_column(name) or meant(name, known),
+        )
 
 
 def _check_attribute(name: str, value: object, where: str) -> None:
     if name in _METHODS and not callable(value):
         raise CalibError(
-            f"the method {name} is {_described(value)}", where=where, expected="a function",
+            f"the method {name} is {_described(value)}",
+            where=where,
+            expected="a function",
             hint=f"write def {name}(self, ...)",
-        )  # fmt: skip
+        )
     if name.startswith("_") or name in _BASE:
         return
     if callable(value):
         raise CalibError(
-            f"the method {name} is none of an effect's, so nothing would call it", where=where,
+            f"the method {name} is none of an effect's, so nothing would call it",
+            where=where,
             expected=", ".join(_METHODS),
             hint=f"{meant(name, _METHODS)} (a helper's name starts with an underscore)",
-        )  # fmt: skip
-    if difflib.get_close_matches(name, _BASE, cutoff=_MISSPELT):
+        )
+    if difflib.get_close_matches(name, _BASE, cutoff=0.8):
         raise CalibError(
-            f"the attribute {name} is none of an effect's", where=where, expected=", ".join(_BASE),
+            f"the attribute {name} is none of an effect's",
+            where=where,
+            expected=", ".join(_BASE),
             hint=f"{meant(name, _BASE)} (a constant's name starts with an underscore)",
-        )  # fmt: skip
+        )
 
 
 def _check_testable(effect: Effect, data: Campaigns) -> None:
     hypothesis = Hypothesis(effect.name, (effect,), (effect_priors(data, effect),))
     units = dict.fromkeys(data.names, 1.0)
     forward = _call(Forward, effect, data, hypothesis, units)
-    psi = forward.priors.sample(generator(0, "gap", "effect check", effect.name), _TRIALS)
+    psi = forward.priors.sample(generator(0, "gap", "effect check", effect.name), 8)
     phi = hypothesis.effect_priors[0].to_natural(psi[:, forward.phi_slices[0]])
     with np.errstate(all="ignore"):
         plain = forward.simulator(psi, data.view)
@@ -162,10 +169,11 @@ def _check_testable(effect: Effect, data: Campaigns) -> None:
         ]
     if not any(changed):
         raise CalibError(
-            "it changes nothing on this case", where=_place(effect),
+            "it changes nothing on this case",
+            where=_place(effect),
             expected=f"on_conditions or on_output that changes {' or '.join(effect.outputs)}",
             hint="correct it, or let not_testable say why the case cannot show it",
-        )  # fmt: skip
+        )
 
 
 def _changes_conditions(effect: Effect, phi: Array, o: OutputData, view: View) -> bool:
@@ -174,8 +182,11 @@ def _changes_conditions(effect: Effect, phi: Array, o: OutputData, view: View) -
     given = {role_of(column): values for column, values in selected.items()}
     found = _call(effect.on_conditions, effect, phi, o.role, dict(given), view)
     if not isinstance(found, dict) or set(found) != set(given):
-        raise _wrong(f"on_conditions returned {_described(found)} for {o.name}", where,
-                     f"a dict with {', '.join(given)}")  # fmt: skip
+        raise _wrong(
+            f"on_conditions returned {_described(found)} for {o.name}",
+            where,
+            f"a dict with {', '.join(given)}",
+        )
     n = view.slip().size
     for name, values in found.items():
         _check_numbers(values, ((n,), (phi.shape[0], n)), f"on_conditions, {name}", where)
@@ -189,17 +200,21 @@ def _changes_output(effect: Effect, phi: Array, o: OutputData, plain: Array, vie
     _check_kept(handed, plain, "on_output", where)
     _check_numbers(found, (plain.shape,), f"on_output for {o.name}", where)
     if not np.isfinite(found[np.isfinite(plain)]).any():
-        raise _wrong(f"on_output returned no finite number for {o.name}", where,
-                     "numbers wherever the location is one")  # fmt: skip
+        raise _wrong(
+            f"on_output returned no finite number for {o.name}",
+            where,
+            "numbers wherever the mean response is one",
+        )
     if any(fact.at_most and fact.output == o.role for fact in effect.known):
         _check_most(effect, phi, o, handed, view)
     sign = next((fact.sign for fact in effect.known if fact.output == o.role), 0)
     added = sign * (found - plain)
-    if (added < -_ROUNDING * np.abs(plain)).any():
+    if (added < -1e-9 * np.abs(plain)).any():
         raise _wrong(
             f"on_output adds {sign * np.nanmin(added):.3g} to {o.name} at some draw of its prior",
-            where, f"{'nothing below' if sign > 0 else 'nothing above'} zero, as known says",
-        )  # fmt: skip
+            where,
+            f"{'nothing below' if sign > 0 else 'nothing above'} zero, as known says",
+        )
     return not np.array_equal(found, plain, equal_nan=True)
 
 
@@ -210,16 +225,21 @@ def _check_most(effect: Effect, phi: Array, o: OutputData, plain: Array, view: V
     _check_kept(handed, plain, "most", where)
     _check_numbers(most, (plain.shape,), f"most for {o.name}", where)
     if not (most[np.isfinite(plain)] >= 0.0).all():
-        raise _wrong(f"most returned {np.min(most):.3g} for {o.name} at some draw of its prior",
-                     where, "numbers from zero on, wherever the location is one")  # fmt: skip
+        raise _wrong(
+            f"most returned {np.min(most):.3g} for {o.name} at some draw of its prior",
+            where,
+            "numbers from zero on, wherever the mean response is one",
+        )
 
 
 def _check_kept(handed: Array, plain: Array, method: str, where: str) -> None:
     if not np.array_equal(handed, plain, equal_nan=True):
         raise CalibError(
-            f"{method} changes the location it is given", where=where, expected="a new array",
-            hint="write location = location + ... instead of location += ...",
-        )  # fmt: skip
+            f"{method} changes the mean response it is given",
+            where=where,
+            expected="a new array",
+            hint="write mean_response = mean_response + ... instead of mean_response += ...",
+        )
 
 
 def _check_numbers(
@@ -227,16 +247,21 @@ def _check_numbers(
 ) -> None:
     right = isinstance(found, np.ndarray) and found.shape in shapes and found.dtype.kind in "fiu"
     if not right:
-        raise _wrong(f"{what} returned {_described(found)}", where,
-                     f"an array of numbers of shape {' or '.join(map(str, shapes))}: "
-                     "draws by rows of the field")  # fmt: skip
+        raise _wrong(
+            f"{what} returned {_described(found)}",
+            where,
+            f"an array of numbers of shape {' or '.join(map(str, shapes))}: "
+            "draws by rows of the field",
+        )
 
 
 def _wrong(message: str, where: str, allowed: str) -> CalibError:
     return CalibError(
-        message, where=where, expected=allowed,
+        message,
+        where=where,
+        expected=allowed,
         hint="correct it; phi[:, :1] is the first parameter as a column, (draws, 1)",
-    )  # fmt: skip
+    )
 
 
 def _described(found: object) -> str:
@@ -259,9 +284,10 @@ def _call[R](function: Callable[..., R], effect: Effect, *args: Any) -> R:
         )
         at = _place(effect) if line is None else f"{_place(effect)}, line {line}"
         raise CalibError(
-            f"it does not run: {type(error).__name__}: {error}", where=at,
-            hint="correct it; view.of(role) gives what the data record, such as view.of(\"slip\")",
-        ) from error  # fmt: skip
+            f"it does not run: {type(error).__name__}: {error}",
+            where=at,
+            hint='correct it; view.of(role) gives what the data record, such as view.of("slip")',
+        ) from error
 
 
 def _role_of_column(name: str) -> str:
@@ -300,13 +326,15 @@ def load_effects(path: Path) -> dict[str, Effect]:
             effect.prior_file = None if effect.priors else beside
             if not effect.priors and not beside.is_file():
                 raise CalibError(
-                    f"the effect {effect.name} has no priors", where=str(beside),
+                    f"the effect {effect.name} has no priors",
+                    where=str(beside),
                     hint="write this file after the example of priors/effects/rate_effect.toml",
-                )  # fmt: skip
+                )
             found[effect.name] = effect
     if not found:
         raise CalibError(
-            "the file defines no effect", where=str(path),
+            "the file defines no effect",
+            where=str(path),
             expected="a subclass of calib.gap.effects.Effect with a name",
-        )  # fmt: skip
+        )
     return found

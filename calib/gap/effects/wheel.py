@@ -46,17 +46,17 @@ class _SoilStrength(Effect):
         stretch = np.exp(np.clip(slope * self.covariate(view), -2.0, 2.0))
         return {**conditions, "slip": conditions["slip"] * stretch}
 
-    def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
+    def on_output(self, phi: Array, output: str, mean_response: Array, view: View) -> Array:
         """Scale the pull and shift the resistance; shift the logarithm of the rut."""
         h = self.covariate(view)
         pull, _, resistance, rut, rut_slip = each(phi)
         if output == "pull":
             factor = np.exp(np.clip(pull * h, -2.0, 2.0))
-            return np.asarray(location * factor + resistance * h * view.load_kn)
+            return np.asarray(mean_response * factor + resistance * h * view.load_kn)
         if output == "sinkage":
             slip = np.maximum(view.slip(), 0.0)
-            return np.asarray(location + (rut + rut_slip * slip) * h)
-        return location
+            return np.asarray(mean_response + (rut + rut_slip * slip) * h)
+        return mean_response
 
     def shape(self, view: View) -> Array | None:
         """The covariate."""
@@ -136,14 +136,14 @@ class BulldozingResistance(Effect):
     known = (Known("pull", -1),)
     outputs = ("pull",)
 
-    def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
+    def on_output(self, phi: Array, output: str, mean_response: Array, view: View) -> Array:
         """Subtract the resistance from the pull."""
         if output != "pull":
-            return location
+            return mean_response
         resistance, exponent, growth = each(phi)
         slip = np.maximum(view.slip(), 0.0)
         sunk = np.minimum(view.sinkage(), 20.0) ** exponent
-        return np.asarray(location - view.load_kn * resistance * sunk * (1.0 + growth * slip))
+        return np.asarray(mean_response - view.load_kn * resistance * sunk * (1.0 + growth * slip))
 
 
 class LugThrust(Effect):
@@ -168,16 +168,16 @@ class LugThrust(Effect):
     needs = ("pull",)  # a rut alone does not tell lugs that dig from slip sinkage
     covariates = ("slip",)
 
-    def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
+    def on_output(self, phi: Array, output: str, mean_response: Array, view: View) -> Array:
         """Add the thrust to the pull, the digging to the logarithm of the rut."""
         thrust, slip_scale, digging = each(phi)
         slip = np.maximum(view.slip(), 0.0)
         if output == "pull":
             grown = 1.0 - np.exp(-slip / slip_scale)
-            return np.asarray(location + view.load_kn * thrust * grown)
+            return np.asarray(mean_response + view.load_kn * thrust * grown)
         if output == "sinkage":
-            return np.asarray(location + digging * slip)
-        return location
+            return np.asarray(mean_response + digging * slip)
+        return mean_response
 
 
 class SlipSinkage(Effect):
@@ -202,16 +202,16 @@ class SlipSinkage(Effect):
     needs = ("sinkage",)  # a pull alone does not tell the sinkage that costs it
     covariates = ("slip",)
 
-    def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
+    def on_output(self, phi: Array, output: str, mean_response: Array, view: View) -> Array:
         """Deepen the rut; take the extra compaction resistance from the pull."""
         growth, exponent, pull_loss = each(phi)
         deeper = growth * np.maximum(view.slip(), 0.0) ** exponent
         if output == "sinkage":
-            return np.asarray(location + deeper)
+            return np.asarray(mean_response + deeper)
         if output == "pull":
             extra = view.sinkage() * np.expm1(np.minimum(deeper, 3.0))
-            return np.asarray(location - view.load_kn * pull_loss * extra)
-        return location
+            return np.asarray(mean_response - view.load_kn * pull_loss * extra)
+        return mean_response
 
 
 class RutRebound(Effect):
@@ -235,13 +235,13 @@ class RutRebound(Effect):
     outputs = ("sinkage",)
     covariates = ("slip",)
 
-    def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
+    def on_output(self, phi: Array, output: str, mean_response: Array, view: View) -> Array:
         """Make the rut shallower."""
         if output != "sinkage":
-            return location
+            return mean_response
         towed, growth, exponent, half_way = each(phi)
         grown = saturating(np.maximum(view.slip(), 1e-4), exponent, half_way)
-        return np.asarray(location - towed - growth * grown)
+        return np.asarray(mean_response - towed - growth * grown)
 
 
 class PostPeakSoftening(Effect):
@@ -271,19 +271,19 @@ class PostPeakSoftening(Effect):
     outputs = ("pull",)
     covariates = ("slip",)
 
-    def most(self, phi: Array, output: str, location: Array, view: View) -> Array:
+    def most(self, phi: Array, output: str, mean_response: Array, view: View) -> Array:
         """Return the gross thrust."""
         resistance = phi[:, 3:]
-        return np.asarray(np.maximum(location + resistance * view.load_kn, 0.0))
+        return np.asarray(np.maximum(mean_response + resistance * view.load_kn, 0.0))
 
-    def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
+    def on_output(self, phi: Array, output: str, mean_response: Array, view: View) -> Array:
         """Lower the thrust past the peak."""
         if output != "pull":
-            return location
+            return mean_response
         loss, peak_slip, slip_scale, _ = each(phi)
         beyond = np.maximum(view.slip() - peak_slip, 0.0) / slip_scale
-        thrust = self.most(phi, output, location, view)
-        return np.asarray(location - thrust * loss * -np.expm1(-beyond))
+        thrust = self.most(phi, output, mean_response, view)
+        return np.asarray(mean_response - thrust * loss * -np.expm1(-beyond))
 
 
 class LoadTransfer(Effect):
@@ -319,9 +319,9 @@ class LoadTransfer(Effect):
         pressure = conditions["ground_pressure"] * factor
         return {**conditions, "ground_pressure": pressure}
 
-    def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
+    def on_output(self, phi: Array, output: str, mean_response: Array, view: View) -> Array:
         """Scale the pull with the load."""
         if output != "pull":
-            return location
+            return mean_response
         transfer, exponent, _ = each(phi)
-        return np.asarray(location * np.exp(exponent * self._ln_load(transfer, view)))
+        return np.asarray(mean_response * np.exp(exponent * self._ln_load(transfer, view)))

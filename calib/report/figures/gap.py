@@ -11,8 +11,9 @@ from matplotlib.axes import Axes
 from scipy.cluster.hierarchy import leaves_list, linkage
 from scipy.spatial.distance import squareform
 
-from calib.gap.diagnose import NAMED, Diagnosis, Placebo, placebos
-from calib.gap.identifiability import ALIKE, Isolability
+from calib.gap.constants import ALIKE, NAMED
+from calib.gap.diagnose import Diagnosis, Placebo, placebos
+from calib.gap.identifiability import Identifiability
 from calib.report.figures.gap_where import conditions_plate, how_far_plate, where_plate
 from calib.report.figures.plate import Plate, draw_all, marked
 from calib.report.figures.style import (
@@ -230,7 +231,7 @@ def _placebo_caption(placebo: Placebo, named: str) -> str:
 
 def isolability_plate(found: Diagnosis) -> Plate | None:
     """Draw the likeness of effects, what parameters absorb, and detectable sizes."""
-    design = found.ranking.isolability
+    design = found.ranking.identifiability
     if not design.absorbed:
         return None
     names = _ordered(design)
@@ -278,12 +279,12 @@ def isolability_plate(found: Diagnosis) -> Plate | None:
     return Plate(fig, "isolability", _design_caption(design), "What this design can tell apart")
 
 
-def _matrix(ax: Axes, design: Isolability, names: list[str], words: list[str]) -> None:
+def _matrix(ax: Axes, design: Identifiability, names: list[str], words: list[str]) -> None:
     n = len(names)
     cosine = np.full((n, n), np.nan)
     for i, a in enumerate(names):
         for j, b in enumerate(names[:i]):
-            cosine[i, j] = design.likeness.get(_key(a, b), np.nan)
+            cosine[i, j] = design.cosine_similarity.get(_key(a, b), np.nan)
     ax.imshow(cosine, vmin=0.0, vmax=1.0, cmap="Blues", aspect="auto")
     for i in range(n):
         for j in range(i):
@@ -314,7 +315,7 @@ def _key(a: str, b: str) -> tuple[str, str]:
     return (a, b) if a < b else (b, a)
 
 
-def _ordered(design: Isolability) -> list[str]:
+def _ordered(design: Identifiability) -> list[str]:
     """Names with those that look alike beside each other."""
     names = sorted(design.absorbed)
     if len(names) < 3:
@@ -322,14 +323,14 @@ def _ordered(design: Isolability) -> list[str]:
     distance = np.zeros((len(names), len(names)))
     for i, a in enumerate(names):
         for j, b in enumerate(names[:i]):
-            cosine = design.likeness.get((b, a), 0.0)
+            cosine = design.cosine_similarity.get((b, a), 0.0)
             distance[i, j] = distance[j, i] = np.clip(1.0 - cosine, 0.0, 2.0)
     tree = linkage(squareform(distance, checks=False), "average", optimal_ordering=True)
     return [names[i] for i in leaves_list(tree)]
 
 
-def _design_caption(design: Isolability) -> str:
-    alike = sorted(design.alike, key=lambda pair: -design.likeness[pair])
+def _design_caption(design: Identifiability) -> str:
+    alike = sorted(design.alike, key=lambda pair: -design.cosine_similarity[pair])
     if alike:
         listed = joined([f"{short_name(a)} with {short_name(b)}" for a, b in alike[:4]])
         rest = len(alike) - 4

@@ -15,20 +15,19 @@ from markupsafe import Markup
 
 from calib.batch.pool import HERE
 from calib.gap.campaigns import OutputData
-from calib.gap.diagnose import NAMED, Diagnosis, placebos
+from calib.gap.constants import (
+    LEFT,
+    MIN_EFFECT_SIZE,
+    MIN_EFFECT_SIZE_IN_PAIR,
+    MOST_LEFT,
+    NAMED,
+    PRIOR,
+)
+from calib.gap.diagnose import Diagnosis, placebos
 from calib.gap.effects.dependence import PREFIX
 from calib.gap.fit import Fit
-from calib.gap.hypotheses import LN_PRIOR
 from calib.gap.mixture import UNLISTED, Region
-from calib.gap.odds import (
-    LEFT,
-    MOST_LEFT,
-    RELEVANT,
-    RELEVANT_IN_PAIR,
-    coarsening,
-    left_of,
-    probabilities,
-)
+from calib.gap.odds import left_of, likelihood_tempering, probabilities
 from calib.models import get_model
 from calib.report.figures.plate import Plate
 from calib.report.gap_evidence import (
@@ -92,7 +91,7 @@ def hypothesis_groups(found: Diagnosis) -> list[dict[str, Any]]:
 def prior_text(found: Diagnosis) -> str:
     """Say how probable the hypotheses were before the data."""
     prior = found.ranking.prior
-    listed = [n for n in prior if n not in LN_PRIOR and "unknown" not in n.split("+")]
+    listed = [n for n in prior if n not in PRIOR and "unknown" not in n.split("+")]
     kinds = {
         "effects by themselves": [n for n in listed if "+" not in n and not n.startswith(PREFIX)],
         "dependences on a condition": [n for n in listed if "+" not in n and n.startswith(PREFIX)],
@@ -272,10 +271,10 @@ def render_diagnosis(
         most_left=f"{MOST_LEFT:g}",
         gap=f"{found.ranking.gap:.1f}",
         left_here=f"{left_of(found.ranking.gap):.2g}",
-        coarse=f"{coarsening(found.ranking.gap):.2f}",
-        before_coarsening=_before_coarsening(found),
-        relevant=f"{RELEVANT:g}",
-        relevant_in_pair=f"{RELEVANT_IN_PAIR:g}",
+        coarse=f"{likelihood_tempering(found.ranking.gap):.2f}",
+        before_coarsening=_before_tempering(found),
+        relevant=f"{MIN_EFFECT_SIZE:g}",
+        relevant_in_pair=f"{MIN_EFFECT_SIZE_IN_PAIR:g}",
         parameters=parameter_rows(found),
         simulators=simulators(found),
         best=title_of(found, found.ranking.order[0]),
@@ -326,7 +325,7 @@ def _shrink_rows(found: Diagnosis) -> list[list[str]]:
     return rows
 
 
-def _before_coarsening(found: Diagnosis) -> str:
+def _before_tempering(found: Diagnosis) -> str:
     """How probable the first explanation would be if formulas were right to the last."""
     ranking = found.ranking
     return odds_text(probabilities(ranking.log_evidence, ranking.odds)[ranking.order[0]])

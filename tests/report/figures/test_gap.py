@@ -82,16 +82,18 @@ def test_nothing_is_cut_off(found, drawn):
 
 def with_long_names(found):
     """Return the diagnosis with effects in its design of longer names than those shipped."""
-    design = found.ranking.isolability
+    design = found.ranking.identifiability
     new = {name: f"depends_on_{name}_and_soil_temperature" for name in sorted(design.absorbed)}
     new[min(new)] = "depends_on_soil_temperature"
     design = replace(
         design,
         absorbed={new[n]: v for n, v in design.absorbed.items()},
         detectable={new[n]: v for n, v in design.detectable.items()},
-        likeness={tuple(sorted((new[a], new[b]))): v for (a, b), v in design.likeness.items()},
+        cosine_similarity={
+            tuple(sorted((new[a], new[b]))): v for (a, b), v in design.cosine_similarity.items()
+        },
     )
-    return replace(found, ranking=replace(found.ranking, isolability=design))
+    return replace(found, ranking=replace(found.ranking, identifiability=design))
 
 
 def test_every_row_is_shown_once_in_where(found, drawn):
