@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
+from calib.batch.environment import one_thread
 from calib.batch.tasks import completed
-from calib.batch.threads import one_thread
 from calib.gap.campaigns import OutputData, campaigns
 from calib.gap.case import read_case
 from calib.gap.constants import SHIFTS

@@ -13,8 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from calib.batch.folders import check_room, writing
-from calib.batch.tasks import alone
+from calib.batch.folders import alone, check_room, writing
 from calib.errors import CalibError
 
 KEY_SCHEMA = "calib/challenge-key/1"

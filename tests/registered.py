@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import pytest
+
+from calib.batch import user_code
 from calib.data.registry import Registry
 
 
@@ -12,7 +15,9 @@ from calib.data.registry import Registry
 def forgotten(*registries: Registry) -> Iterator[None]:
     """Take out of registries what was put in meanwhile."""
     before = [set(registry) for registry in registries]
-    yield
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(user_code, "_loaded", {})
+        yield
     for registry, names in zip(registries, before, strict=True):
         for name in set(registry) - names:
             registry.discard(name)

@@ -5,23 +5,25 @@ from __future__ import annotations
 import logging
 import pickle
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from importlib.metadata import version
 from importlib.util import find_spec
 from multiprocessing import active_children
+from pathlib import Path
 from typing import Any
 
 import dask
-from distributed import Client, LocalCluster, as_completed
+from distributed import Client, LocalCluster, WorkerPlugin, as_completed
 from distributed.scheduler import KilledWorker
 from distributed.utils import silence_logging_cmgr
 
 from calib.batch.environment import code_sha256
 from calib.batch.pool import interruptions_held
 from calib.batch.tasks import Finished, attempt, describe
+from calib.batch.user_code import Loader, load, loaded
 from calib.errors import CalibError
 
 WINDOW = 1000  # tasks at the scheduler; enough for a large cluster, and their items fit in memory
@@ -134,7 +136,6 @@ def _local(workers: int) -> Iterator[Client]:
                     memory_limit=1.0 / workers,
                     dashboard_address="127.0.0.1:0",  # any free port: the usual one may be taken
                     silence_logs=logging.CRITICAL,
-                    preload=["calib.batch.plugins"],
                 )
                 stack.enter_context(_ended(cluster))
         except RuntimeError as error:
@@ -143,6 +144,7 @@ def _local(workers: int) -> Iterator[Client]:
                 hint='in a script of yours, put the call below `if __name__ == "__main__":`',
             ) from error
         client = stack.enter_context(Client(cluster, set_as_default=False))
+        client.register_plugin(_UserFiles(loaded()))
         yield client
         # A worker that died is being replaced: Dask cannot close its nanny meanwhile.
         with suppress(TimeoutError):
@@ -168,6 +170,17 @@ def _ended(cluster: LocalCluster) -> Iterator[None]:
         # Results are here by now, and a process that Dask fails to end will end with this one.
         with suppress(AssertionError, TimeoutError):
             cluster.close(timeout=CLOSE_SECONDS)
+
+
+class _UserFiles(WorkerPlugin):
+    """Has every worker load the files of the user's own that this process has loaded."""
+
+    def __init__(self, files: Mapping[Path, Loader]) -> None:
+        self.files = files
+
+    def setup(self, worker: object) -> None:
+        """Load them, as Dask calls it in a worker that starts."""
+        load(self.files)
 
 
 class _Client(Client):

@@ -1,9 +1,8 @@
-"""What numbers depend on besides data, priors and seed: versions, processor, the code itself.
-
-What numbers depend on besides data, priors and seed: versions, processor, the code itself.
+"""What numbers depend on beside data, priors and seed: versions, processor, the code itself.
 
 Where these differ, numbers may be rounded otherwise; what that may change is stated in
-`calib.check.tolerances`.
+`calib.check.tolerances`. One thread of linear algebra, whatever the machine has and the caller has
+set, for several add up in another order; and no floating-point errors.
 """
 
 from __future__ import annotations
@@ -14,12 +13,14 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from calib.errors import CalibError
 
-_BENCH = "challenge"
+if TYPE_CHECKING:
+    import numpy as np
 
 
 @contextmanager
@@ -34,7 +35,7 @@ def from_the_bench(what: str) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] != _BENCH:
+        if (error.name or "").partition(".")[0] != "challenge":
             raise
         raise CalibError(
             "the challenge is a test bench of the repository, not of the wheel",
@@ -114,8 +115,6 @@ def _machine() -> dict[str, str]:
 
     import numpy as np
 
-    from calib.batch.threads import blas_kernels
-
     config: Any = np.show_config(mode="dicts")
     simd, blas = config["SIMD Extensions"], config["Build Dependencies"]["blas"]
     return {
@@ -180,3 +179,36 @@ def _digest(files: Mapping[str, Path]) -> str:
         digest.update(f"{name}\0{len(content)}\0".encode())
         digest.update(content)
     return digest.hexdigest()
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Do linear algebra on one thread: the last bits are the same on any number of cores.
+
+    Also a decorator. The matrices are small, so that more threads would not be faster. Nor does
+    it matter whether the caller has NumPy raise floating-point errors.
+    """
+    with _libraries().limit(limits=1, user_api="blas"), no_floating_point_errors():
+        yield
+
+
+def no_floating_point_errors() -> np.errstate:
+    """Have NumPy warn of what it would raise, as it does by default (not of underflow)."""
+    import numpy as np
+
+    usual: Any = {"divide": "warn", "over": "warn", "under": "ignore", "invalid": "warn"}
+    set_here: dict[str, Any] = np.geterr()  # type: ignore[assignment]
+    return np.errstate(**{k: usual[k] if v == "raise" else v for k, v in set_here.items()})
+
+
+def blas_kernels() -> list[str]:
+    """Name the processors that the linear algebra's kernels are made for, as it chose them."""
+    found = {str(library.get("architecture", "")) for library in _libraries().info()}
+    return sorted(found - {""})
+
+
+@cache
+def _libraries() -> Any:
+    # SciPy brings a library of its own, which has to be there to be told.
+    import_module("scipy.linalg")
+    return import_module("threadpoolctl").ThreadpoolController()

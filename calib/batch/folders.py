@@ -1,23 +1,27 @@
-"""Output folders that appear whole or not at all."""
+"""Output folders that appear whole or not at all, and what is finished before they do.
+
+A command that is interrupted, or finds no room for its result at the end, has as a rule finished
+something: posteriors of some of its models, say. Each is kept in memory as soon as it is there,
+and other processes leave theirs in a folder.
+"""
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import os
+import pickle
 import re
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
 
-from calib.batch import foreign
 from calib.errors import CalibError
 
-# Files by which a folder is known to be one of ours, and may be replaced.
+# Files by which a folder is known to be one of ours, and may be replaced; and what else is in it.
 _OURS = ("manifest.json", "run.json", "diagnosis.json", "score.txt", "audit.json",
          "comparison.json")  # fmt: skip
 _WRITTEN = (
@@ -26,22 +30,24 @@ _WRITTEN = (
     "methods.tex", "references.bib", "audit.csv", "inputs.json", "runs", "emulator.npz",
     "emulators", "compared", "held_out.csv",
 )  # fmt: skip
-
-# Scratch folders of results to be written by this process: of each its lock.
-_claimed: dict[Path, tuple[Path, int | None]] = {}
-# Where the work began for which a folder is claimed: code of a user's own may have gone elsewhere.
-_began_in: list[Path] = []
-_YOUNG_SECONDS = 60.0
-# In a scratch folder: the result, what other processes finish of it, and room for it.
-_WHOLE, _PARTS, _RESERVED = "whole", "parts", "reserved"
 # A folder with posteriors is of some megabytes; with less than this left it is not begun.
 _ROOM_BYTES = 16_000_000
 # The disk is full, the quota used up, the file system read-only.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 
+type Write = Callable[[Path], object]
 
-def _is_ours(name: str) -> bool:
-    return name in _WRITTEN or name.endswith((".nc", ".png"))
+# Folders that commands of this process have written, or what of theirs was rescued.
+saved: list[Path] = []
+# Scratch folders of results to be written by this process, and the lock of each.
+_claims: dict[Path, tuple[Path, int | None]] = {}
+# Where the work began for which a folder is claimed: code of a user's own may have gone elsewhere.
+_began_in: list[Path] = []
+# What is finished, by the name of the folder that it gets if its command does not write it.
+_finished: dict[str, Write] = {}
+# Where other processes leave what they finish, and whether this is one of them.
+_parts: Path | None = None
+_works_for_another = False
 
 
 @contextmanager
@@ -59,13 +65,13 @@ def fresh_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
     if _began_in:
         os.chdir(_began_in[-1])
     out = _real(Path(out))
-    claim = _claimed.pop(out.absolute(), None)
+    claim = _claims.pop(out.absolute(), None)
     if claim is None:
         out = _replaceable(out, overwrite=overwrite)
     scratch, held = claim or _scratch(out)
-    whole = scratch / _WHOLE
+    whole = scratch / "whole"
     try:
-        (scratch / _RESERVED).unlink(missing_ok=True)
+        (scratch / "reserved").unlink(missing_ok=True)
         whole.mkdir()
         yield whole
         if overwrite and out.exists():
@@ -75,9 +81,9 @@ def fresh_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
             shutil.rmtree(old)
         else:
             _put(whole, out)
-        foreign.saved.append(out)
+        saved.append(out)
         if claim is not None:
-            foreign.drop()
+            drop()
     except OSError as error:
         # NumPy says of a full disk itself what the system would, without its number.
         if error.errno not in (*NO_ROOM, None):
@@ -85,23 +91,23 @@ def fresh_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
         raise _unwritable(out, error.strerror or str(error)) from None
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
-        if held is not None:
-            os.close(held)
+        _release(held)
 
 
 @contextmanager
 def claimed(out: Path, *, overwrite: bool = False) -> Iterator[None]:
     """Keep a folder, which will be written at the end of long work, from other processes.
 
-    What can be known before the work is found here: that it may not be written or replaced, that
-    the disk is full, or that another process is about to write it. Room on the disk is reserved.
-    What the work has finished is rescued (`calib.batch.foreign`) if it is not written.
+    What can be known before the work is found here: that the folder may not be written or replaced,
+    that the disk is full, or that another process is about to write it. Room on the disk is
+    reserved. What the work has finished (see `keep`) is rescued if the folder is not written.
 
     Raises
     ------
     CalibError
         As `fresh_folder` does, or if the folder is claimed already.
     """
+    global _parts
     out = _replaceable(Path(out), overwrite=overwrite)
     with writing(out):
         living = out.parent.is_dir() and any(_is_alive(path) for path, _ in _scratches(out))
@@ -111,32 +117,119 @@ def claimed(out: Path, *, overwrite: bool = False) -> Iterator[None]:
             where=str(out),
             hint="wait until it ends, stop it, or choose another --out",
         )
-    scratch, held = _claimed[out.absolute()] = _scratch(out)
+    scratch, held = _claims[out.absolute()] = _scratch(out)
     try:
         with writing(out):
-            _reserve(scratch / _RESERVED)
-        with foreign.working(scratch / _PARTS):
-            _began_in.append(Path.cwd())
-            try:
-                yield
-            finally:
-                os.chdir(_began_in.pop())
-                foreign.rescue(out)
+            _reserve(scratch / "reserved")
+            _parts = scratch / "parts"
+            _parts.mkdir()
+        _began_in.append(Path.cwd())
+        try:
+            yield
+        finally:
+            os.chdir(_began_in.pop())
+            _rescue(out)
     finally:
         # Written or not, nothing of it is needed any more.
+        _parts = None
+        _finished.clear()
         shutil.rmtree(scratch, ignore_errors=True)
-        if _claimed.pop(out.absolute(), None) is not None and held is not None:
-            os.close(held)
+        if _claims.pop(out.absolute(), None) is not None:
+            _release(held)
 
 
 def _reserve(path: Path) -> None:
     """Take the room that a result needs, where the system can."""
-    with path.open("wb") as file, contextlib.suppress(AttributeError):
+    with path.open("wb") as file, suppress(AttributeError):
         try:
             os.posix_fallocate(file.fileno(), 0, _ROOM_BYTES)
         except OSError as error:
             if error.errno in NO_ROOM:
                 raise
+
+
+def _put(whole: Path, out: Path) -> None:
+    """Give a folder its name; where another process has taken it meanwhile, one beside it."""
+    with suppress(OSError):
+        out.rmdir()  # an empty one
+    try:
+        whole.replace(out)
+    except OSError as error:
+        if not out.exists():
+            raise
+        beside = _free(out, first=2)
+        whole.replace(beside)
+        raise CalibError(
+            "another process has written the output folder meanwhile",
+            where=str(out),
+            hint=f"look for the result of this one in {beside}",
+        ) from error
+
+
+def _free(path: Path, first: int = 1) -> Path:
+    """Return the path, or with a number at its end the first that is not there."""
+    names = (path if i == 1 else path.with_name(f"{path.name}-{i}") for i in count(first))
+    return next(p for p in names if not p.exists())
+
+
+def keep(name: str, write: Write) -> None:
+    """Keep a result until its command has written it.
+
+    Parameters
+    ----------
+    name : str
+        Of the folder that it gets if the command does not.
+    write : callable
+        Writes it into an empty folder; can be pickled where other processes finish it.
+    """
+    if _parts is None:
+        return
+    if not _works_for_another:
+        _finished[name] = write
+        return
+    with suppress(Exception):  # a copy in case of need: the result itself goes on its way
+        part = _parts / f".{name}"
+        part.write_bytes(pickle.dumps(write))
+        part.replace(_parts / name)
+
+
+def drop() -> None:
+    """Forget what was kept: it is written."""
+    _finished.clear()
+    for path in [] if _parts is None else _parts.iterdir():
+        path.unlink()
+
+
+def parts() -> Path | None:
+    """Return the folder for what other processes finish, if this one keeps it."""
+    return _parts
+
+
+def work_for(folder: Path | None) -> None:
+    """Leave what is finished in this process for another in its folder, if it has one."""
+    global _parts, _works_for_another
+    _parts, _works_for_another = folder, True
+
+
+def _rescue(out: Path) -> None:
+    """Write what is kept beside an output folder, or else with temporary files."""
+    found = dict(_finished)
+    for path in [] if _parts is None else sorted(_parts.glob("[!.]*")):
+        with suppress(Exception):  # of a process that was killed meanwhile
+            found.setdefault(path.name, pickle.loads(path.read_bytes()))
+    for parent in (out.parent, Path(tempfile.gettempdir())) if found else ():
+        folder = _free(parent / f"{out.name}-unfinished")
+        try:
+            for name, write in found.items():
+                (folder / name).mkdir(parents=True)
+                write(folder / name)
+        except BaseException as error:
+            shutil.rmtree(folder, ignore_errors=True)
+            if not isinstance(error, Exception):
+                raise
+        else:
+            saved.append(folder)
+            return
 
 
 def _replaceable(out: Path, *, overwrite: bool) -> Path:
@@ -159,10 +252,24 @@ def _real(out: Path) -> Path:
 
 
 def _scratch(out: Path) -> tuple[Path, int | None]:
-    """Make the scratch folder of a result, and lock it."""
+    """Make the scratch folder of a result, and lock it; remove those of runs that were killed.
+
+    The lock of a killed process is gone. Folders younger than a minute are left: their process may
+    be about to lock them. An earlier result that was being replaced stays if it is the only one
+    there is.
+    """
     with writing(out):
         out.parent.mkdir(parents=True, exist_ok=True)
-        _remove_abandoned(out)
+        for path, old in _scratches(out):
+            if old and not out.exists():
+                continue
+            with suppress(OSError):
+                if time.time() - path.stat().st_mtime < 60.0:
+                    continue
+                held = lock(path)
+                if held is not None:
+                    shutil.rmtree(path, ignore_errors=True)
+                    os.close(held)
         scratch = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
         return scratch, lock(scratch)
 
@@ -179,32 +286,12 @@ def _scratches(out: Path) -> Iterator[tuple[Path, bool]]:
 def _is_alive(scratch: Path) -> bool:
     """Whether the process that made a scratch folder still runs."""
     try:
-        held = lock(scratch)
+        _release(lock(scratch))
     except BlockingIOError:
         return True
     except OSError:  # gone meanwhile
-        return False
-    if held is not None:
-        os.close(held)
+        pass
     return False
-
-
-def _put(scratch: Path, out: Path) -> None:
-    """Give a folder its name; where another process has taken it meanwhile, one beside it."""
-    with contextlib.suppress(OSError):
-        out.rmdir()  # an empty one
-    try:
-        scratch.replace(out)
-    except OSError as error:
-        if not out.exists():
-            raise
-        beside = next(p for i in count(2) if not (p := out.with_name(f"{out.name}-{i}")).exists())
-        scratch.replace(beside)
-        raise CalibError(
-            "another process has written the output folder meanwhile",
-            where=str(out),
-            hint=f"look for the result of this one in {beside}",
-        ) from error
 
 
 def lock(folder: Path) -> int | None:
@@ -219,34 +306,44 @@ def lock(folder: Path) -> int | None:
         import fcntl
     except ImportError:
         return None
-    found = os.open(folder, os.O_RDONLY)
+    held = os.open(folder, os.O_RDONLY)
     try:
-        fcntl.flock(found, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
-        os.close(found)
+        os.close(held)
         if isinstance(error, BlockingIOError):
             raise
         return None
-    return found
+    return held
 
 
-def _remove_abandoned(out: Path) -> None:
-    """Remove the scratch folders of runs into `out` that were killed.
+def _release(held: int | None) -> None:
+    if held is not None:
+        os.close(held)
 
-    The lock of a killed process is gone. Folders younger than a minute are left: their process
-    may be about to lock them. An earlier result that was being replaced stays if it is the only
-    one there is.
+
+@contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """Hold the lock of a folder that is there; the system releases it however the process ends.
+
+    Raises
+    ------
+    CalibError
+        If another process holds it.
     """
-    for path, old in _scratches(out):
-        if old and not out.exists():
-            continue
-        with contextlib.suppress(OSError):
-            if time.time() - path.stat().st_mtime < _YOUNG_SECONDS:
-                continue
-            held = lock(path)
-            if held is not None:
-                shutil.rmtree(path, ignore_errors=True)
-                os.close(held)
+    with writing(folder):
+        try:
+            held = lock(folder)
+        except BlockingIOError:
+            raise CalibError(
+                "another process is writing results to this folder",
+                where=str(folder),
+                hint="wait until it ends, or stop it",
+            ) from None
+    try:
+        yield
+    finally:
+        _release(held)
 
 
 def read_folder(folder: Path) -> dict[str, bytes]:
@@ -266,7 +363,7 @@ def write_whole(path: Path, text: str) -> None:
         part.write_text(text, encoding="utf-8")
         part.replace(path)
     finally:
-        with contextlib.suppress(OSError):
+        with suppress(OSError):
             part.unlink(missing_ok=True)
 
 
@@ -287,16 +384,10 @@ def _unwritable(out: Path, why: str) -> CalibError:
     )
 
 
-def check_room(out: Path) -> None:
+def check_room(out: Path, parent: Path | None = None) -> None:
     """Raise a CalibError, before long work, if a file or into a folder nothing can be written."""
-    _check_place(out, out if out.is_dir() else _above(out))
-
-
-def _above(out: Path) -> Path:
-    return next(p for p in out.absolute().parents if p.exists())
-
-
-def _check_place(out: Path, parent: Path) -> None:
+    if parent is None:
+        parent = out if out.is_dir() else _above(out)
     if not parent.is_dir():
         raise _unwritable(out, f"{parent} is a file")
     if not os.access(parent, os.W_OK | os.X_OK):
@@ -306,43 +397,44 @@ def _check_place(out: Path, parent: Path) -> None:
         raise _unwritable(out, f"only {left / 1e6:.1f} MB are left on its disk")
 
 
+def _above(out: Path) -> Path:
+    return next(p for p in out.absolute().parents if p.exists())
+
+
 def check_folder(out: Path, *, overwrite: bool = False) -> None:
     """Raise a CalibError, before long work, if a folder may not be written, or not replaced."""
     out = _real(out)
     with writing(out):
         exists = out.exists()
-    if not exists:
-        _check_place(out, _above(out))
-        return
-    if not out.is_dir():
-        raise CalibError(
-            "the output folder is an existing file", where=str(out), hint="choose another --out"
+
+    def refuse(why: str, hint: str) -> CalibError:
+        return CalibError(f"the output folder {why}", where=str(out), hint=hint)
+
+    if exists and not out.is_dir():
+        raise refuse("is an existing file", "choose another --out")
+    if exists and out.resolve() == Path.cwd():
+        raise refuse(
+            "is the current folder, which cannot be replaced",
+            "choose another --out, such as a new folder inside it",
         )
-    if out.resolve() == Path.cwd():
-        raise CalibError(
-            "the output folder is the current folder, which cannot be replaced",
-            where=str(out),
-            hint="choose another --out, such as a new folder inside it",
-        )
-    _check_place(out, _above(out))
-    if not any(out.iterdir()):
+    check_room(out, _above(out))
+    if not exists or not any(out.iterdir()):
         return
     if not overwrite:
-        raise CalibError(
-            "the output folder exists and is not empty",
-            where=str(out),
-            hint="choose another --out, or pass --overwrite to replace it",
+        raise refuse(
+            "exists and is not empty",
+            "choose another --out, or pass --overwrite to replace it",
         )
     if not any((out / name).exists() for name in _OURS):
-        raise CalibError(
-            "the output folder was not written by calib, so it is not replaced",
-            where=str(out),
-            hint="choose another --out, or delete the folder yourself",
+        raise refuse(
+            "was not written by calib, so it is not replaced",
+            "choose another --out, or delete the folder yourself",
         )
-    foreign = sorted(p.name for p in out.iterdir() if not _is_ours(p.name))
-    if foreign:
-        raise CalibError(
-            f"the output folder holds files that calib did not write: {', '.join(foreign[:5])}",
-            where=str(out),
-            hint="move them elsewhere, or choose another --out",
+    others = sorted(
+        p.name for p in out.iterdir() if p.name not in _WRITTEN and p.suffix not in (".nc", ".png")
+    )
+    if others:
+        raise refuse(
+            f"holds files that calib did not write: {', '.join(others[:5])}",
+            "move them elsewhere, or choose another --out",
         )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -18,8 +18,8 @@ from pathlib import Path
 from threading import Thread, current_thread, main_thread
 from types import FrameType
 
-from calib.batch import foreign
-from calib.batch.plugins import load_files, loaded_files
+from calib.batch.folders import parts, work_for
+from calib.batch.user_code import Loader, load, loaded
 from calib.errors import CalibError
 
 
@@ -49,7 +49,7 @@ HERE: Executor = _InThisProcess()
 
 
 @contextmanager
-def pool(workers: int, files: Sequence[Path] = ()) -> Iterator[Executor]:
+def pool(workers: int, files: Mapping[Path, Loader] | None = None) -> Iterator[Executor]:
     """Yield an executor of some processes, or `HERE` with a single worker.
 
     A piece is a call of a module's function with arguments that can be pickled. It takes every
@@ -59,8 +59,8 @@ def pool(workers: int, files: Sequence[Path] = ()) -> Iterator[Executor]:
     ----------
     workers : int
         A script that asks for more than one needs ``if __name__ == "__main__":``.
-    files : sequence of Path, optional
-        Python files of the user's own that the processes run, beside those that are loaded here.
+    files : mapping of Path to callable, optional
+        Files of the user's own that the processes load, and how, beside those that are loaded here.
 
     Raises
     ------
@@ -71,7 +71,7 @@ def pool(workers: int, files: Sequence[Path] = ()) -> Iterator[Executor]:
         yield HERE
         return
     executor = ProcessPoolExecutor(
-        workers, get_context("spawn"), _begin, ([*loaded_files(), *files], foreign.place())
+        workers, get_context("spawn"), _begin, (loaded() | dict(files or {}), parts())
     )
     try:
         with interruptions_held():
@@ -112,11 +112,11 @@ def interruptions_held() -> Iterator[None]:
         usual(*came[0])
 
 
-def _begin(files: Sequence[Path], parts: Path | None) -> None:
+def _begin(files: Mapping[Path, Loader], parts: Path | None) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # it is for the process that waits
     Thread(target=_end_with_parent, daemon=True).start()
-    foreign.work_for(parts)
-    load_files(files)
+    work_for(parts)
+    load(files)
 
 
 def _end_with_parent() -> None:

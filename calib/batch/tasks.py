@@ -7,7 +7,6 @@ missing when it is called again; `completed` hands results over as they come and
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
 import time
@@ -19,7 +18,7 @@ from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from calib.batch.folders import check_room, lock, writing
+from calib.batch.folders import alone, check_room, writing
 from calib.errors import CalibError
 
 FAILED = "failed.json"
@@ -296,31 +295,6 @@ def _landing(folder: Path, suffix: str) -> Iterator[Callable[[Finished[Any]], No
         finally:
             clock.close()
             shutil.rmtree(scratch, ignore_errors=True)
-
-
-@contextmanager
-def alone(folder: Path) -> Iterator[None]:
-    """Hold the lock of a folder that is there; the system releases it however the process ends.
-
-    Raises
-    ------
-    CalibError
-        If another process holds it.
-    """
-    with writing(folder):
-        try:
-            held = lock(folder)
-        except BlockingIOError:
-            raise CalibError(
-                "another process is writing results to this folder",
-                where=str(folder),
-                hint="wait until it ends, or stop it",
-            ) from None
-    try:
-        yield
-    finally:
-        if held is not None:
-            os.close(held)
 
 
 def failed_tasks(folder: Path) -> dict[str, str]:

@@ -29,9 +29,9 @@ class _Commands(TyperGroup):
     """All commands: what the user can put right, or stops, ends with a line and no traceback."""
 
     def invoke(self, ctx: Any) -> Any:
-        from calib.batch import foreign
+        from calib.batch import folders
 
-        foreign.saved.clear()
+        folders.saved.clear()
         interrupted.clear()
         try:
             return super().invoke(ctx)
@@ -47,9 +47,9 @@ class _Commands(TyperGroup):
                 why, code = "", INTERRUPTED
             elif not why:
                 raise
-        why = why or ("interrupted" if foreign.saved else STOPPED)
+        why = why or ("interrupted" if folders.saved else STOPPED)
         print(f"calib: {why}", file=sys.stderr)
-        for folder in foreign.saved:
+        for folder in folders.saved:
             print(f"calib: what was finished is in {folder}", file=sys.stderr)
         raise typer.Exit(code)
 

@@ -157,8 +157,7 @@ def fit(
     from functools import partial
 
     from calib import SamplerSettings, build_problem, calibrate, estimate, save_calibration
-    from calib.batch.folders import claimed, fresh_folder
-    from calib.batch.foreign import keep
+    from calib.batch.folders import claimed, fresh_folder, keep
     from calib.inference.random import generator
     from calib.models import get_model
     from calib.report.numbers import format_number
@@ -239,8 +238,7 @@ def compare(
     """Say which of several models the same data prefer, and what they cannot tell."""
     from functools import partial
 
-    from calib.batch.folders import claimed, fresh_folder
-    from calib.batch.foreign import drop, keep
+    from calib.batch.folders import claimed, drop, fresh_folder, keep
     from calib.inference.prior_files import prior_file_model
     from calib.inference.sampling.sampler import SamplerSettings
     from calib.models import get_model
@@ -448,11 +446,11 @@ def _predict_corrected(
     run: Path, at: Path, out: Path | None, effects: Path | None, without: Sequence[str]
 ) -> None:
     """Predict with the corrected model of a diagnosis, beside the calibrated simulator."""
-    from calib.batch.plugins import load_files
     from calib.data import read_for_model
     from calib.gap.corrected import conditions_outside, load_corrected, predict_columns
     from calib.gap.effects import EFFECTS
     from calib.gap.effects.user import load_effects
+    from calib.models.simulators.files import load_files
 
     load_files(sorted((run / "emulators").glob("*.npz")))
     own = {} if effects is None else load_effects(effects)

@@ -39,9 +39,9 @@ def diagnose(
     """Find where a calibrated model misses, which effect it lacks, how far adding it gains."""
     from functools import partial
 
-    from calib.batch.folders import claimed, fresh_folder
-    from calib.batch.foreign import keep
+    from calib.batch.folders import claimed, fresh_folder, keep
     from calib.batch.pool import pool
+    from calib.batch.user_code import run_file
     from calib.data.quantities import OUTPUTS, QUANTITIES
     from calib.gap.batch import INPUTS, inputs_record
     from calib.gap.case import case_from_run, read_case
@@ -68,14 +68,14 @@ def diagnose(
             hint="give one of the two",
         )
     own = {} if effects is None else load_effects(effects)
-    own_files = [] if effects is None else [effects]
-    files = [*own_files, *(e.prior_file for e in own.values() if e.prior_file is not None)]
+    files = [] if effects is None else [effects]
+    files += [e.prior_file for e in own.values() if e.prior_file is not None]
     considered = {**EFFECTS, **own}
     # The diagnosis looks at them too, but only after simulators have been emulated.
     check_effects(considered, given)
     emulations = prepare_case(given, run, seed, workers)
     manifest = {"seed": seed, "command": opt.command()}
-    with pool(workers, files=own_files) as side:
+    with pool(workers, {} if effects is None else {effects: run_file}) as side:
         found = diagnose_case(given, seed, effects=considered, pool=side)
         keep("diagnosis", partial(write_diagnosis, found))
         write_page = begin_page(found, manifest, pool=side)
@@ -117,10 +117,10 @@ def prepare_case(case: Case, run: Path | None, seed: int, workers: int) -> list[
     """Emulate the slow simulators of a case for both of its campaigns; say how good each is."""
     import numpy as np
 
-    from calib.batch.plugins import load_files
     from calib.data.quantities import OUTPUTS
     from calib.gap.campaigns import campaigns
     from calib.inference.emulation.prepared import prepare, prepare_field, reaches
+    from calib.models.simulators.files import load_files
     from calib.models.simulators.registered import simulated_by
 
     if run is None and not any(map(simulated_by, case.models.values())):

@@ -47,9 +47,10 @@ Scheduler = Annotated[
 
 def _load(paths: list[Path] | None) -> list[Path] | None:
     """Register what the files declare, before names are looked up."""
-    from calib.batch.plugins import load_files
+    if paths:
+        from calib.models.simulators.files import load_files
 
-    load_files(paths or ())
+        load_files(paths)
     return paths
 
 

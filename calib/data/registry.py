@@ -8,8 +8,7 @@ from pathlib import Path
 from types import FunctionType
 from typing import Protocol
 
-from calib.batch.plugins import PLUGINS, declared_in, load_installed
-from calib.batch.sources import fingerprint
+from calib.batch.user_code import PLUGINS, declared_in, fingerprint, load_installed
 from calib.errors import CalibError
 
 

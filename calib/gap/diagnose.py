@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.batch.environment import one_thread
 from calib.batch.pool import HERE
-from calib.batch.threads import one_thread
 from calib.data.quantities import OUTPUTS, columns_of, role_of
 from calib.gap.campaigns import Campaigns, campaigns
 from calib.gap.case import Case, Context, new_values, read_case

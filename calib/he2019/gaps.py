@@ -26,7 +26,7 @@ import scipy
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from calib.batch.threads import one_thread
+from calib.batch.environment import one_thread
 from calib.data import Table, table_from_arrays, write_table
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from scipy.special import digamma, polygamma
 
-from calib.batch.plugins import declared_in
+from calib.batch.user_code import declared_in
 from calib.data.files import MEND_TOML, read_text
 from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError, in_words, meant

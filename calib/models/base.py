@@ -19,7 +19,7 @@ from unicodedata import normalize
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.batch.foreign import call
+from calib.batch.user_code import call
 from calib.data.files import MEND_TOML, real_array
 from calib.data.quantities import OUTPUTS, QUANTITIES, convert
 from calib.errors import CalibError

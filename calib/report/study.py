@@ -15,9 +15,9 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from calib.batch.foreign import keep
+from calib.batch.environment import one_thread
+from calib.batch.folders import keep
 from calib.batch.pool import HERE
-from calib.batch.threads import one_thread
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import PointEstimate, estimate, methods_for

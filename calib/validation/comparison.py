@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from scipy.special import logsumexp
 
-from calib.batch.foreign import keep
+from calib.batch.folders import keep
 from calib.data import Table
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration, calibrate

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.special import bdtr, ndtri
 
-from calib.batch.threads import one_thread
+from calib.batch.environment import one_thread
 from calib.data import Table
 from calib.data.checks import stretches
 from calib.data.table import parse_header

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import betaincinv, ndtri
 
-from calib.batch.threads import one_thread
+from calib.batch.environment import one_thread
 from calib.inference.calibration import Calibration
 from calib.inference.diagnostics import power_scaled_weights, power_sensitivity
 from calib.inference.problem import Problem

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import logsumexp
 
+from calib.batch.environment import one_thread
 from calib.batch.tasks import completed
-from calib.batch.threads import one_thread
 from calib.data import Table
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration

@@ -26,11 +26,10 @@ import pytest
 from typer.testing import CliRunner, Result
 
 import calib
-from calib.batch import foreign as unfinished
+from calib.batch import folders as unfinished
 from calib.batch.folders import claimed, fresh_folder
-from calib.batch.foreign import call, set_apart
-from calib.batch.plugins import run_file
 from calib.batch.pool import pool
+from calib.batch.user_code import call, run_file, set_apart
 from calib.cli import _readable
 from calib.cli.app import app
 from calib.data.files import decoded, read_json
@@ -40,7 +39,7 @@ from calib.inference.prior_files import default_priors, read_priors
 from calib.models import MODELS, example_csv
 from calib.models.simulators.base import Failure, Output, Simulator
 from calib.models.simulators.child import of_surroundings
-from calib.models.simulators.files import read_simulator
+from calib.models.simulators.files import read_simulator, register_file
 from calib.models.simulators.process import run_program
 from calib.models.simulators.registered import SIMULATED
 from calib.models.simulators.runs import RunKeeper
@@ -60,7 +59,7 @@ X = {"slip_ratio": np.array([0.1, 0.2]), "normal_load_kn": np.array([4.0, 5.0])}
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", sys.path[:])
-    monkeypatch.setenv("CALIB_MODELS", "")
+    monkeypatch.setattr("calib.batch.user_code._loaded", {})
     Path("ruts.csv").write_text(example_csv("bekker"), encoding="utf-8")
     Path("slip.csv").write_text(example_csv("modified_bekker"), encoding="utf-8")
     modules = set(sys.modules)
@@ -653,7 +652,7 @@ def test_a_simulator_imports_what_lies_beside_it(limit: str, tmp_path: Path) -> 
     path = write_helped(tmp_path / "a", 3.0, limit=limit)
     assert pulled(path) == pytest.approx(3.0 * 2.0 * 0.6 * 4.0 / 1000.0)
     # In another process too.
-    with pool(2, files=[path]) as side:
+    with pool(2, {path: register_file}) as side:
         assert side.submit(pulled, path).result() == pulled(path)
 
 

@@ -201,7 +201,7 @@ HOLD = """
 import sys
 from pathlib import Path
 from calib.batch.folders import claimed
-from calib.batch.tasks import alone
+from calib.batch.folders import alone
 out = Path(sys.argv[2])
 if sys.argv[1] == "alone":
     out.mkdir(parents=True)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.batch.plugins import run_file
+from calib.batch.user_code import run_file
 from calib.data import read_table
 from calib.errors import CalibError
 from calib.gap.constants import MIN_FIELD_ROWS

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import pickle
 import sys
 from collections.abc import Iterator
@@ -32,14 +31,10 @@ FEW = ["--max-steps", 400]
 @pytest.fixture(autouse=True)
 def as_before() -> Iterator[None]:
     """Forget what a test registers."""
-    environment = os.environ.pop("CALIB_MODELS", None)
     with forgotten(QUANTITIES, MODELS, EFFECTS):
         yield
     for name in [m for m in sys.modules if m.startswith("calib_user_")]:
         del sys.modules[name]
-    os.environ.pop("CALIB_MODELS", None)
-    if environment is not None:
-        os.environ["CALIB_MODELS"] = environment
 
 
 def field_of(example: str, rng: np.random.Generator) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -32,10 +31,8 @@ FEW = ["--max-steps", 400]
 @pytest.fixture(autouse=True)
 def as_before() -> Iterator[None]:
     """Forget what a test registers."""
-    os.environ.pop("CALIB_MODELS", None)
     with forgotten(MODELS, SIMULATED):
         yield
-    os.environ.pop("CALIB_MODELS", None)
 
 
 def write_table(path: str, columns: dict[str, np.ndarray]) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 import calib
-from calib.batch.plugins import run_file
+from calib.batch.user_code import run_file
 from calib.errors import CalibError
 from calib.gap.campaigns import campaigns
 from calib.gap.diagnose import diagnose

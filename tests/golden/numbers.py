@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 import calib
-from calib.batch.plugins import run_file
+from calib.batch.user_code import run_file
 from calib.models import MODELS, example_csv
 from calib.models.simulators.registered import SIMULATED
 from calib.validation.replicate import Item, replicate

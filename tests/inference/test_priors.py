@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 from scipy.integrate import quad
 
-from calib.batch.plugins import run_file
+from calib.batch.user_code import run_file
 from calib.errors import CalibError
 from calib.inference.prior_files import (
     default_priors,

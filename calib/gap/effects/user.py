@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.batch.plugins import declared_in, run_file
+from calib.batch.user_code import declared_in, run_file
 from calib.data.quantities import QUANTITIES, role_of
 from calib.errors import CalibError, meant
 from calib.gap.campaigns import Campaigns, OutputData, campaigns

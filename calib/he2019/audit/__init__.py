@@ -12,8 +12,8 @@ from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
+from calib.batch.environment import one_thread
 from calib.batch.pool import HERE
-from calib.batch.threads import one_thread
 from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict, finding
 from calib.he2019.audit.pull import (
     RoundingStudy,

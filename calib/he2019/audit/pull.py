@@ -35,7 +35,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares, linprog, minimize, minimize_scalar
 
-from calib.batch.threads import one_thread
+from calib.batch.environment import one_thread
 from calib.he2019.audit.bounds import (
     ASSUMED_SLIPS,
     NAMES,

@@ -17,7 +17,7 @@ from itertools import product
 import numpy as np
 from scipy.optimize import minimize
 
-from calib.batch.threads import one_thread
+from calib.batch.environment import one_thread
 from calib.data import Table
 from calib.he2019.audit.bounds import (
     ASSUMED_SLIPS,

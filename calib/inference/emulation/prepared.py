@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from calib.batch.plugins import load_files
 from calib.data import Table
 from calib.data.files import real_array
 from calib.data.reader import open_csv
@@ -31,6 +30,7 @@ from calib.models import get_model
 from calib.models.base import Array
 from calib.models.simulators.base import FAILED, Failure, Simulator
 from calib.models.simulators.emulator import Emulator, Training, emulator_of, save_emulator
+from calib.models.simulators.files import load_files
 from calib.models.simulators.registered import SIMULATED, Simulated, simulated_by, slow_simulator
 from calib.models.simulators.runs import Run, RunKeeper
 from calib.models.simulators.ways import TableWay, columns_of

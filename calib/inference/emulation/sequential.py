@@ -20,7 +20,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.batch.threads import one_thread
+from calib.batch.environment import one_thread
 from calib.inference.emulation.judge import (
     FORESEEN_FROM,
     WORTH,

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.batch.threads import one_thread
+from calib.batch.environment import one_thread
 from calib.data.registry import Registry
 from calib.errors import CalibError
 from calib.inference.estimators.genetic import GeneticSettings, estimate_genetic, minimise_genetic

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from calib.batch.threads import one_thread
+from calib.batch.environment import one_thread
 from calib.errors import CalibError
 from calib.inference.constants import ANNEALED, JUDGED, LEAST_STEPS, LONG_DATA
 from calib.inference.diagnostics import (

@@ -5,16 +5,17 @@ from __future__ import annotations
 import hashlib
 import shlex
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
-from calib.batch.plugins import run_file
+from calib.batch.user_code import load, run_file
 from calib.data.files import MEND_TOML, read_text, read_toml
 from calib.errors import CalibError, in_words, meant
 from calib.models.simulators.base import Way
+from calib.models.simulators.emulator import use_emulator
 from calib.models.simulators.registered import SIMULATED, Budget, Simulated, declare, written
 from calib.models.simulators.ways import (
     CallableWay,
@@ -65,6 +66,25 @@ class SimulatorFile(BaseModel):
     ranges: dict[str, tuple[float, float]] = {}
     emulator: Budget = Budget()
     parameters: dict[str, dict[str, Any]] = Field(min_length=1)
+
+
+def load_files(paths: Sequence[Path]) -> None:
+    """Load files that register things, here and in processes to come.
+
+    Python files of quantities, models or effects; simulator files (``.toml``); emulators
+    (``.npz``). In this order, for each kind may name what those before it register.
+
+    Raises
+    ------
+    CalibError
+        If one cannot be run, or what it declares does not hold together.
+    """
+    loaders = {".toml": register_file, ".npz": use_emulator}
+    ordered = sorted(
+        map(Path, paths),
+        key=lambda path: ("", *loaders).index(path.suffix if path.suffix in loaders else ""),
+    )
+    load({path: loaders.get(path.suffix, run_file) for path in ordered})
 
 
 def register_file(path: Path) -> Simulated:

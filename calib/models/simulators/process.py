@@ -16,7 +16,7 @@ from typing import Any
 from uuid import uuid4
 
 from calib.batch.folders import check_room
-from calib.batch.plugins import USER_MODULE
+from calib.batch.user_code import USER_MODULE
 from calib.data.files import decoded
 from calib.errors import CalibError
 from calib.models.simulators.base import Failure, not_made, tail

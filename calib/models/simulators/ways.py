@@ -26,9 +26,7 @@ from uuid import uuid4
 
 import numpy as np
 
-from calib.batch.foreign import call
-from calib.batch.plugins import declared_in
-from calib.batch.sources import content_of, fingerprint
+from calib.batch.user_code import call, content_of, declared_in, fingerprint
 from calib.data.files import read_text, real_array
 from calib.errors import CalibError
 from calib.models.base import Array

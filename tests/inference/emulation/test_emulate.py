@@ -30,7 +30,7 @@ CONDITIONS = ("slip_ratio", "normal_load_kn")
 @pytest.fixture(autouse=True)
 def as_before(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     # Empty as if it were not there; what a test sets goes with it.
-    monkeypatch.setenv("CALIB_MODELS", "")
+    monkeypatch.setattr("calib.batch.user_code._loaded", {})
     with forgotten(MODELS, SIMULATED):
         yield
 

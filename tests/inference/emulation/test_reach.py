@@ -23,7 +23,7 @@ from tests.registered import forgotten
 
 @pytest.fixture(autouse=True)
 def as_before(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setenv("CALIB_MODELS", "")
+    monkeypatch.setattr("calib.batch.user_code._loaded", {})
     with forgotten(MODELS, SIMULATED):
         yield
 

@@ -94,7 +94,7 @@ def test_a_model_of_a_file_is_refused_with_its_file(tmp_path: Path) -> None:
         "    conditions=('slip_ratio',), parameters=('chain', 's0'), predict=pull,\n"
         "    priors=PRIORS.replace('.mu]', '.chain]')))\n"
     )
-    from calib.batch.plugins import load_files
+    from calib.models.simulators.files import load_files
 
     with pytest.raises(CalibError, match="chain has the name of a dimension") as refused:
         load_files([path])
