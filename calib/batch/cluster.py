@@ -20,23 +20,12 @@ from distributed import Client, LocalCluster, WorkerPlugin, as_completed
 from distributed.scheduler import KilledWorker
 from distributed.utils import silence_logging_cmgr
 
+from calib.batch.constants import CLOSE_SECONDS, CONNECT_SECONDS, WINDOW
 from calib.batch.environment import code_sha256
 from calib.batch.pool import interruptions_held
 from calib.batch.tasks import Finished, attempt, describe
 from calib.batch.user_code import Loader, load, loaded
 from calib.errors import CalibError
-
-WINDOW = 1000  # tasks at the scheduler; enough for a large cluster, and their items fit in memory
-CONNECT_SECONDS = 10
-CLOSE_SECONDS = 20
-_SETTINGS = {
-    # When the worker of a task dies, the task is tried once more among the others.
-    "distributed.scheduler.allowed-failures": 1,
-    # Dask has the C library return every freed array at once, which doubles the time of ours.
-    "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": None,
-    # Items are sent with their tasks on purpose: the workers have no other way to them.
-    "distributed.admin.large-graph-warning-threshold": "1 TB",
-}
 
 
 def on_cluster[I, R](
@@ -51,10 +40,18 @@ def on_cluster[I, R](
     """Yield tasks as they come to their end (see `calib.batch.tasks.completed`)."""
     # A cluster of our own need not be larger than the work.
     connected = _local(min(workers, len(names))) if scheduler is None else _existing(scheduler)
+    settings = {
+        # When the worker of a task dies, the task is tried once more among the others.
+        "distributed.scheduler.allowed-failures": 1,
+        # Dask has the C library return every freed array at once, which doubles the time of ours.
+        "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": None,
+        # Items are sent with their tasks on purpose: the workers have no other way to them.
+        "distributed.admin.large-graph-warning-threshold": "1 TB",
+    }
     # What goes wrong is reported once, as the error of a task or as ours.
     with (
         silence_logging_cmgr(logging.CRITICAL),
-        dask.config.set(_SETTINGS),
+        dask.config.set(settings),
         connected as client,
     ):
         announce(_describe(client, local=scheduler is None))

@@ -48,7 +48,6 @@ _PACKAGES = (
     "terracalib", "numpy", "scipy", "emcee", "arviz", "arviz-base", "arviz-stats", "xarray",
     "matplotlib", "corner", "pillow", "jinja2", "h5netcdf", "h5py",
 )  # fmt: skip
-_SOURCES = (".py", ".j2", ".css", ".js", ".toml")
 
 
 @dataclass(frozen=True)
@@ -167,7 +166,9 @@ def _sources(package: Path, but: Path | None = None) -> dict[str, Path]:
     return {
         path.relative_to(package).as_posix(): path
         for path in package.rglob("*")
-        if path.suffix in _SOURCES and path.is_file() and but not in path.parents
+        if path.suffix in (".py", ".j2", ".css", ".js", ".toml")
+        and path.is_file()
+        and but not in path.parents
     }
 
 

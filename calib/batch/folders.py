@@ -19,6 +19,7 @@ from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
 
+from calib.batch.constants import ROOM_BYTES, YOUNG_SECONDS
 from calib.errors import CalibError
 
 # Files by which a folder is known to be one of ours, and may be replaced; and what else is in it.
@@ -30,8 +31,6 @@ _WRITTEN = (
     "methods.tex", "references.bib", "audit.csv", "inputs.json", "runs", "emulator.npz",
     "emulators", "compared", "held_out.csv",
 )  # fmt: skip
-# A folder with posteriors is of some megabytes; with less than this left it is not begun.
-_ROOM_BYTES = 16_000_000
 # The disk is full, the quota used up, the file system read-only.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 
@@ -142,7 +141,7 @@ def _reserve(path: Path) -> None:
     """Take the room that a result needs, where the system can."""
     with path.open("wb") as file, suppress(AttributeError):
         try:
-            os.posix_fallocate(file.fileno(), 0, _ROOM_BYTES)
+            os.posix_fallocate(file.fileno(), 0, ROOM_BYTES)
         except OSError as error:
             if error.errno in NO_ROOM:
                 raise
@@ -264,7 +263,7 @@ def _scratch(out: Path) -> tuple[Path, int | None]:
             if old and not out.exists():
                 continue
             with suppress(OSError):
-                if time.time() - path.stat().st_mtime < 60.0:
+                if time.time() - path.stat().st_mtime < YOUNG_SECONDS:
                     continue
                 held = lock(path)
                 if held is not None:
@@ -393,7 +392,7 @@ def check_room(out: Path, parent: Path | None = None) -> None:
     if not os.access(parent, os.W_OK | os.X_OK):
         raise _unwritable(out, f"no permission to write in {parent}")
     left = shutil.disk_usage(parent).free
-    if left < _ROOM_BYTES:
+    if left < ROOM_BYTES:
         raise _unwritable(out, f"only {left / 1e6:.1f} MB are left on its disk")
 
 

@@ -23,7 +23,6 @@ from calib.errors import CalibError
 
 FAILED = "failed.json"
 SECONDS = "seconds.csv"
-_SCRATCH = ".landing"
 
 
 @dataclass(frozen=True)
@@ -262,7 +261,7 @@ def _landing(folder: Path, suffix: str) -> Iterator[Callable[[Finished[Any]], No
     next one removes. Nothing is synced to the disk: a machine that loses power may lose the last
     seconds' results.
     """
-    scratch = folder / _SCRATCH
+    scratch = folder / ".landing"
     check_room(folder)
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)

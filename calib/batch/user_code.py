@@ -33,13 +33,6 @@ from calib.errors import CalibError
 PLUGINS = "terracalib.plugins"  # entry points of packages that register several things
 USER_MODULE = "calib_user_"  # what the names of modules begin with that were loaded by their paths
 
-_DOTTED = re.compile(r"[^\W\d]\w*(?:\.\w+)*")
-_PATH = re.compile(r"[\w.+-]+(?:/[\w.+-]+)*")
-# Beside what has no ending and may be executed.
-_PROGRAMS = {
-    ".exe", ".jl", ".js", ".lua", ".m", ".pl", ".py", ".r", ".rb", ".sh", ".so", ".tcl",
-}  # fmt: skip
-_PLAIN = (int, float, complex, str, bytes, type(None), np.ndarray, np.generic)
 # Python, installed packages and this one: their files are taken alone, without what they import.
 _INSTALLED = (
     *(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib", "purelib")),
@@ -57,8 +50,6 @@ _content: dict[str, str] = {}
 _went: dict[str, str] = {}
 # Groups of entry points that were loaded.
 _groups: set[str] = set()
-# Code that is not calib's own, which may leave threads and files open.
-_others: set[str] = set()
 
 
 def load(files: Mapping[Path, Loader]) -> None:
@@ -105,7 +96,6 @@ def run_file(path: Path, what: str = "models") -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     # Known by its name, so that what it defines can be handed to other processes.
     sys.modules[name] = module
-    _others.add(name)
     _content[name] = content_of(path)
     before = _working_directory()
     try:
@@ -171,11 +161,6 @@ def _check_beside(path: Path) -> None:
             )
 
 
-def others_loaded() -> bool:
-    """Whether this process has run code that is not calib's own."""
-    return bool(_others)
-
-
 def declared_in(declared: object) -> str:
     """Return the file of a user's function or class, or its module where that has no file.
 
@@ -199,8 +184,6 @@ def load_installed(group: str) -> None:
         return
     _groups.add(group)
     for point in entry_points(group=group):
-        if not point.value.startswith("calib."):
-            _others.add(point.value)
         try:
             found = point.load()
         except (Exception, SystemExit) as error:
@@ -286,7 +269,7 @@ def own_files(path: Path, *, named: bool = True) -> tuple[Path, ...]:
         new: set[Path] = set()
         for text in texts if named else ():
             new.update(_programs(this.parent, text))
-            imports += [(text, 0)] if _DOTTED.fullmatch(text) else []
+            imports += [(text, 0)] if re.fullmatch(r"[^\W\d]\w*(?:\.\w+)*", text) else []
         for name, up in imports:
             around = {path.parent, this.parent, folder.parent}
             for root in {this.parents[up - 1]} if up else around:
@@ -370,11 +353,11 @@ def _modules(root: Path, parts: list[str]) -> Iterator[Path]:
 
 def _programs(folder: Path, text: str) -> Iterator[Path]:
     """Yield the programs below a folder that a text names, as a path or the end of one."""
-    for path in set(_PATH.findall(text)):
+    for path in set(re.findall(r"[\w.+-]+(?:/[\w.+-]+)*", text)):
         parts = path.split("/")
         for i in range(len(parts)):
             file = folder.joinpath(*parts[i:])
-            written = file.suffix.lower() in _PROGRAMS
+            written = re.fullmatch(r"\.(exe|jl|js|lua|m|pl|py|r|rb|sh|so|tcl)", file.suffix.lower())
             built = not file.suffix and os.access(file, os.X_OK)
             if (written or built) and file.is_file():
                 yield file.resolve()
@@ -460,7 +443,7 @@ def _installed(path: Path) -> bool:
 def _plain(value: Any) -> bool:
     if isinstance(value, tuple):
         return all(map(_plain, value))
-    return isinstance(value, _PLAIN)
+    return isinstance(value, int | float | complex | str | bytes | None | np.ndarray | np.generic)
 
 
 def _code(code: CodeType) -> tuple[Any, ...]:

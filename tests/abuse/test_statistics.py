@@ -12,14 +12,13 @@ import pytest
 from typer.testing import CliRunner
 
 from calib.cli.app import app
-from calib.data import read_for_model, table_from_arrays
-from calib.data.checks import beyond_notes, column_notes
+from calib.data import table_from_arrays
+from calib.data.checks import column_notes
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import estimate
 from calib.inference.prior_files import default_priors
 from calib.inference.problem import build_problem
-from calib.models import get_model
 from calib.report.verdict import verdict
 from calib.validation.assumptions import file_remarks
 
@@ -112,21 +111,6 @@ def test_psi_typed_as_kpa_in_some_rows() -> None:
     assert f"lines {lines}: average ground pressure is 6.895 times smaller" in warned(found)
 
 
-def in_metres(rows: Rows) -> Rows:
-    return Rows(rows.slip, rows.pressure, rows.rut / 1000.0)
-
-
-def test_a_whole_column_in_another_unit(clean: Calibration) -> None:
-    rows = in_metres(Rows.made())
-    table = _table(rows.slip, rows.pressure, rows.rut)
-    said = " | ".join(column_notes(table))
-    assert "ruts.csv, rut_depth_mm: the largest rut depth is 0.0" in said
-    assert "about 1000 times too small" in said
-    with pytest.raises(CalibError, match="about 1000 times too small") as caught:
-        build_problem(MODEL, table)
-    assert "'rut_depth_mm (checked)'" in str(caught.value)
-
-
 @pytest.mark.parametrize(("load", "factor", "told"), [
     (5.0, 1.0, ()), (5.0, 1e3, ("pull",)), (5.0, 1e-3, ("pull",)), (5e3, 1e-3, ("load",)),
     (0.06, 1.0, ()), (0.06, 1e3, ("load",)), (5e3, 1.0, ("pull", "load")), (None, 1e-3, ("pull",)),
@@ -144,46 +128,6 @@ def test_forces_of_which_one_is_in_another_unit(
         assert (f"the largest {'drawbar' if word == 'pull' else 'normal'} {word}" in said) == (
             word in told
         )
-
-
-@pytest.mark.parametrize(("header", "values", "units"), [
-    ("tyre_width_m", [11.2, 13.0], "cm or inch"),
-    ("tyre_diameter_m", [26.0, 31.0], "cm or inch"),
-    ("slip_percent", [0.0, 0.02, 0.6], "fractions"),
-    ("slip_percent", [0.0, 2.0, 60.0], ""),
-    ("slip_percent", [0.0, 0.0], ""),
-    ("normal_load_kn", [900.0, 1100.0], "N or lbf"),
-    ("cone_index_psi", [4000.0, 4600.0], "kPa"),
-    ("cone_index_kpa", [20.0, 460.0], ""),  # in bar they would be usual as well
-])  # fmt: skip
-def test_a_column_in_another_of_its_units(header: str, values: list[float], units: str) -> None:
-    said = " | ".join(column_notes(table_from_arrays({header: values}, source="wheel.csv")))
-    assert bool(said) == bool(units)
-    assert units in said
-
-
-@pytest.mark.parametrize(("header", "values", "units"), [
-    ("inflation_pressure_psi", [124.1, 206.8, 289.6], "kPa"),
-    ("inflation_pressure_kpa", [18.0, 30.0, 42.0], "psi"),
-    ("inflation_pressure_psi", [10.0, 14.0], ""),
-    ("inflation_pressure_psi", [20.0, 206.8], "kPa"),  # of the one beyond the others
-    ("inflation_pressure_psi", [124.1, 5000.0], ""),
-])  # fmt: skip
-def test_conditions_beyond_the_calibrated_ones_in_another_unit(
-    header: str, values: list[float], units: str
-) -> None:
-    known = {"inflation_pressure_psi": np.array([17.9, 30.0, 42.1])}
-    said = " | ".join(beyond_notes(table_from_arrays({header: values}), known))
-    assert said.partition("readings are in ")[2].partition(";")[0] == units
-
-
-def test_one_row_that_is_far_too_large_is_not_the_columns_unit() -> None:
-    pull = np.linspace(0.5, 1.5, 20)
-    pull[7] *= 1e3
-    columns = {"slip_ratio": np.linspace(0.05, 0.6, 20), "drawbar_pull_kn": pull}
-    assert not list(column_notes(table_from_arrays(columns, source="pull.csv")))
-    columns["drawbar_pull_kn"] = 1e3 * np.linspace(0.5, 1.5, 20)
-    assert len(list(column_notes(table_from_arrays(columns, source="pull.csv")))) == 1
 
 
 def test_duplicated_rows(clean: Calibration) -> None:
@@ -227,13 +171,6 @@ def test_fewer_settings_than_parameters_are_told() -> None:
     said = " | ".join(remark.text for remark in file_remarks(problem, 0.03))
     assert "few.csv: the rows are at 3 different settings of the conditions" in said
     assert "about 6 parameters" in said
-
-
-@pytest.mark.parametrize("n", [1, 2, 3])
-def test_fewer_rows_than_parameters(n: int) -> None:
-    rows = Rows.made().take(np.arange(n))
-    with pytest.raises(CalibError, match="cannot calibrate"):
-        rows.calibrated()
 
 
 def test_heavy_tails(tmp_path: Path) -> None:
@@ -285,29 +222,6 @@ def written(rows: Rows, path: Path) -> Path:
     columns = zip(rows.slip, rows.pressure, rows.rut, strict=True)
     path.write_text("\n".join([*lines, *(",".join(f"{v:.4f}" for v in r) for r in columns)]) + "\n")
     return path
-
-
-@pytest.mark.slow
-def test_warnings_are_on_the_terminal_the_page_and_in_the_summary(tmp_path: Path) -> None:
-    rows = Rows.made()
-    rows.rut[17] *= 100.0
-    file = written(rows.take(np.append(np.arange(N), 5)), tmp_path / "ruts.csv")
-    run = CliRunner()
-    fit = run.invoke(
-        app, ["fit", str(file), "--model", MODEL, "--out", str(tmp_path / "run"), "--workers", "1"]
-    )
-    assert fit.exit_code == 0, fit.output
-    report = run.invoke(
-        app,
-        ["report", str(file), "--model", MODEL, "--out", str(tmp_path / "report"), "--workers", "1",
-         "--no-posteriors"],
-    )  # fmt: skip
-    assert report.exit_code == 0, report.output
-    page = (tmp_path / "report" / "index.html").read_text(encoding="utf-8")
-    told = json.loads((tmp_path / "report" / "summary.json").read_text(encoding="utf-8"))
-    for text in (fit.stderr, report.stderr, page, "".join(told["models"]["rut_depth"]["warnings"])):
-        assert "line 19: rut_depth_mm" in text
-        assert "line 50: this row repeats another one exactly" in text
 
 
 @pytest.mark.slow
@@ -363,10 +277,3 @@ def test_a_report_with_another_noise_checks_and_says_what_the_data_prefer(tmp_pa
     for folder in ("run", "report"):
         check = run.invoke(app, ["check", str(tmp_path / folder), "--workers", "1"])
         assert check.exit_code == 0, check.output
-
-
-def test_the_file_is_read_as_it_was_written(tmp_path: Path) -> None:
-    model = get_model(MODEL)
-    rows = Rows.made()
-    table = read_for_model(written(rows, tmp_path / "ruts.csv"), (*model.conditions, model.output))
-    np.testing.assert_allclose(table["rut_depth_mm"], rows.rut, atol=1e-4)

@@ -51,14 +51,12 @@ CONTRACT = {
 
 
 def test_every_effect_of_the_contract_is_there() -> None:
-    """Names are those of the contract's table."""
     assert set(LISTED) == CONTRACT
     assert len({kind.draw(np.random.default_rng(0)).variant for kind in UNLISTED}) >= 15
 
 
 @pytest.mark.parametrize("name", sorted(CONTRACT))
 def test_effect_touches_only_its_outputs(name: str) -> None:
-    """An effect changes one of its outputs, and density only if it is a probe's."""
     changed = {key for key, value in change(name, field()).items() if np.abs(value).max() > 1e-9}
     assert changed & set(kind_of(name).outputs)
     assert ("bulk_density" in changed) == (name in ("cone_index_bias", "water_content_bias"))
@@ -73,7 +71,6 @@ def test_effect_touches_only_its_outputs(name: str) -> None:
     ],
 )
 def test_covariate_effects_sleep_in_the_lab(name: str, still: dict[str, float]) -> None:
-    """Where the covariate is the lab's, nothing changes."""
     at = replace(field(), **{key: np.full(30, value) for key, value in still.items()})
     for seed in range(4):
         for value in change(name, at, seed).values():
@@ -92,7 +89,6 @@ def test_covariate_effects_sleep_in_the_lab(name: str, still: dict[str, float]) 
     ],
 )
 def test_direction_and_growth_with_slip(name: str, output: str, sign: int) -> None:
-    """Effects have the sign of their cause, and those of slip grow with it."""
     for seed in range(4):
         at = conditions(8, slip=np.linspace(0.05, 0.65, 8), pass_number=3.0)
         got = sign * change(name, at, seed)[output]
@@ -102,14 +98,12 @@ def test_direction_and_growth_with_slip(name: str, output: str, sign: int) -> No
 
 
 def test_drift_begins_at_nothing_and_offset_is_constant() -> None:
-    """The first run has no drift; an offset is the same everywhere."""
     for seed in range(6):
         assert change("sensor_drift", field(), seed)["drawbar_pull"][0] == pytest.approx(0.0)
     assert np.ptp(change("force_offset", field())["drawbar_pull"]) < 1e-12
 
 
 def test_load_transfer_agrees_with_itself() -> None:
-    """With half a kN of load per kN of pull, the rut is that of the transferred load."""
     family = next(
         f
         for f in (kind_of("load_transfer").draw(np.random.default_rng(s)) for s in range(9))
@@ -122,7 +116,6 @@ def test_load_transfer_agrees_with_itself() -> None:
 
 
 def test_slip_zero_keeps_the_labs_rolling_radius() -> None:
-    """A slip shift moves along the undisturbed curve."""
     family = kind_of("slip_zero_shift").draw(np.random.default_rng(0))
     at = conditions(6, slip=np.linspace(0.1, 0.6, 6), inflation_kpa=200.0)
     got = simulate(reality().with_mechanisms(family.at(0.02)), at)["drawbar_pull"]
@@ -131,7 +124,6 @@ def test_slip_zero_keeps_the_labs_rolling_radius() -> None:
 
 
 def test_shift_of_no_amount_changes_nothing() -> None:
-    """Another soil at amount 0 is the same soil, at amount 1 it is not."""
     direction, _ = draw_shift(np.random.default_rng(2))
     base, at = simulate(reality(), field()), field()
     same = simulate(shifted(reality(), direction, 0.0), at)
@@ -142,7 +134,6 @@ def test_shift_of_no_amount_changes_nothing() -> None:
 
 
 def test_unknown_name_is_refused_and_needs_follow_the_model() -> None:
-    """Names outside the contract raise; slip sinkage needs a model without it."""
     with pytest.raises(CalibError, match="no effect named 'wind'"):
         kind_of("wind")
     assert needs_of((kind_of("slip_sinkage"),)).rut_model == "bekker"
@@ -150,7 +141,6 @@ def test_unknown_name_is_refused_and_needs_follow_the_model() -> None:
 
 
 def test_reality_shares_nothing_with_the_effects_that_explain_it() -> None:
-    """No module of the challenge imports the models, the gap or their priors."""
     allowed = ("calib.errors", "calib.batch.tasks", "calib.batch.folders")
     for path in Path(challenge.__file__).parent.glob("*.py"):
         tree = ast.parse(path.read_text(encoding="utf-8"))
@@ -179,7 +169,6 @@ def oddity(variant: str, at: Conditions, seed: int = 0) -> tuple[Readings, Readi
 def test_bands_cost_pull_inside_and_nothing_outside(
     variant: str, condition: str, values: np.ndarray
 ) -> None:
-    """Hop, bounce and clogging act in a band of their condition, wherever it is drawn."""
     at = replace(conditions(60, slip=np.full(60, 0.3)), **{condition: values})
     for seed in range(4):
         got, without = oddity(variant, at, seed)
@@ -189,7 +178,6 @@ def test_bands_cost_pull_inside_and_nothing_outside(
 
 
 def test_every_second_pass_is_driven_back() -> None:
-    """A grade costs one way what it gives the other."""
     at = conditions(4, slip=np.full(4, 0.3), pass_number=np.array([1.0, 2.0, 3.0, 4.0]))
     got, without = oddity("to_and_fro", at)
     gap = got["drawbar_pull"] - without["drawbar_pull"]

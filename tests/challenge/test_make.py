@@ -42,7 +42,11 @@ def each_case(blind_test: BlindTest) -> list[tuple[Path, dict[str, Any]]]:
 
 
 def test_folders_hold_exactly_the_contracts_files(blind_test: BlindTest) -> None:
-    """Four files per case, a manifest and a hash beside them, numbered from zero."""
+    assert sha256(blind_test.key.read_bytes()) == blind_test.digest
+    assert (blind_test.cases / "HASH").read_text(encoding="utf-8").strip() == blind_test.digest
+    manifest = json.loads((blind_test.cases / "manifest.json").read_text(encoding="utf-8"))
+    assert (manifest["key_sha256"], manifest["n_cases"]) == (blind_test.digest, 6)
+    assert "seed" not in manifest
     names = sorted(path.name for path in blind_test.cases.iterdir())
     assert names == ["HASH", *(f"case-{i:03d}" for i in range(6)), "manifest.json"]
     for folder, _ in each_case(blind_test):
@@ -51,7 +55,6 @@ def test_folders_hold_exactly_the_contracts_files(blind_test: BlindTest) -> None
 
 
 def test_tables_have_the_contracts_columns(blind_test: BlindTest) -> None:
-    """Columns are known, equal in lab and field, and without outputs in fresh."""
     for folder, entry in each_case(blind_test):
         (lab, _), (field, rows), (fresh, unseen) = (
             table(folder / f"{name}.csv") for name in ("lab", "field", "fresh")
@@ -68,7 +71,6 @@ def test_tables_have_the_contracts_columns(blind_test: BlindTest) -> None:
 
 
 def test_case_file_names_files_and_models(blind_test: BlindTest) -> None:
-    """The case file is TOML as the contract shows it."""
     allowed = {
         "drawbar_pull": {"magic_formula", "magic_formula_pressure"},
         "rut_depth": {"bekker", "modified_bekker"},
@@ -83,7 +85,6 @@ def test_case_file_names_files_and_models(blind_test: BlindTest) -> None:
 
 
 def test_readings_scatter_about_the_truth_by_the_stated_noise(blind_test: BlindTest) -> None:
-    """Field readings less the key's truth, over its noise sd, are standard normal."""
     z = []
     for folder, entry in each_case(blind_test):
         header, rows = table(folder / "field.csv")
@@ -97,7 +98,6 @@ def test_readings_scatter_about_the_truth_by_the_stated_noise(blind_test: BlindT
 
 
 def test_gaps_are_as_large_as_promised(blind_test: BlindTest) -> None:
-    """Nulls have no gap at all, everything else at least two noise sds."""
     for _, entry in each_case(blind_test):
         parts = [
             (np.array(entry["field_truth"][n]) - np.array(entry["field_without"][n])) / np.array(sd)
@@ -109,7 +109,6 @@ def test_gaps_are_as_large_as_promised(blind_test: BlindTest) -> None:
 
 
 def test_no_case_gives_its_answer_away(blind_test: BlindTest) -> None:
-    """Neither truth, mechanism nor seed stands in anything that is published."""
     key = open_key(blind_test.cases, blind_test.key)
     words = {entry["truth"] for entry in key["cases"].values()} - {"none"}
     words |= {entry["mechanism"] for entry in key["cases"].values()} | {key["salt"]}
@@ -120,7 +119,6 @@ def test_no_case_gives_its_answer_away(blind_test: BlindTest) -> None:
 
 
 def test_nothing_is_its_own_rival(blind_test: BlindTest) -> None:
-    """A rival is a wrong answer: not the truth, nor a part of it."""
     for case in open_key(blind_test.cases, blind_test.key)["cases"].values():
         if case["truth"] != "none":
             assert case["rival"] not in case["truth"].split("+")
@@ -129,7 +127,6 @@ def test_nothing_is_its_own_rival(blind_test: BlindTest) -> None:
 
 @pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_same_seed_same_bytes(blind_test: BlindTest, tmp_path: Path, workers: int) -> None:
-    """Two processes write what one wrote, byte for byte; another seed does not."""
     again = make(tmp_path / "c", tmp_path / "key.json", seed=5, n_cases=6, workers=workers)
     assert again == blind_test.digest
     assert (tmp_path / "key.json").read_bytes() == blind_test.key.read_bytes()
@@ -141,18 +138,7 @@ def test_same_seed_same_bytes(blind_test: BlindTest, tmp_path: Path, workers: in
     assert a.files["lab.csv"] != b.files["lab.csv"]
 
 
-def test_hash_is_that_of_the_key(blind_test: BlindTest) -> None:
-    """The hash returned, published twice, and computed agree."""
-    assert sha256(blind_test.key.read_bytes()) == blind_test.digest
-    assert (blind_test.cases / "HASH").read_text(encoding="utf-8").strip() == blind_test.digest
-    manifest = json.loads((blind_test.cases / "manifest.json").read_text(encoding="utf-8"))
-    assert manifest["key_sha256"] == blind_test.digest
-    assert manifest["n_cases"] == 6
-    assert "seed" not in manifest
-
-
 def test_plan_has_the_promised_shares() -> None:
-    """A third of nulls, an eighth unlisted, a tenth shifts, every effect, pairs only if hard."""
     planned = plan(np.random.default_rng(0), 480, ("easy", "hard"))
     for tier in ("easy", "hard"):
         truths = Counter(truth for at, truth in planned if at == tier)
@@ -174,7 +160,6 @@ def test_large_gaps_have_no_nulls_and_up_to_three_causes() -> None:
 
 
 def test_the_key_says_what_each_of_several_causes_adds() -> None:
-    """A large gap; each contribution is what goes from it without that cause."""
     truth = "force_offset+lug_thrust+sensor_drift"
     made = make_case(np.random.SeedSequence([5, 1]), "large", truth).key
     assert made["gap_over_noise"] >= 5.0
@@ -196,28 +181,22 @@ def test_every_noise_has_its_sd_and_nothing_else_is_the_same(kind: str) -> None:
 
 
 def test_key_is_never_among_the_cases(tmp_path: Path) -> None:
-    """A key inside the cases' folder, an old folder or an old key are refused."""
     with pytest.raises(CalibError, match="must not lie with the cases"):
         make(tmp_path / "c", tmp_path / "c" / "key.json", seed=1, n_cases=1)
     (tmp_path / "old").mkdir()
     (tmp_path / "old" / "x").write_text("x", encoding="utf-8")
     with pytest.raises(CalibError, match="not empty"):
         make(tmp_path / "old", tmp_path / "key.json", seed=1, n_cases=1)
+    for n_cases, tiers in ((0, ("easy",)), (1, ("middling",)), (1, ())):
+        with pytest.raises(CalibError):
+            make(tmp_path / "c", tmp_path / "k", seed=1, n_cases=n_cases, tiers=tiers)  # type: ignore[arg-type]
+        assert not (tmp_path / "c").exists()
     (tmp_path / "key.json").write_text("{}", encoding="utf-8")
     with pytest.raises(CalibError, match="a key is there already"):
         make(tmp_path / "new", tmp_path / "key.json", seed=1, n_cases=1)
 
 
-@pytest.mark.parametrize(("n_cases", "tiers"), [(0, ("easy",)), (1, ("middling",)), (1, ())])
-def test_bad_numbers_are_refused(tmp_path: Path, n_cases: int, tiers: tuple[str, ...]) -> None:
-    """No cases or unknown tiers raise before anything is written."""
-    with pytest.raises(CalibError):
-        make(tmp_path / "c", tmp_path / "k.json", seed=1, n_cases=n_cases, tiers=tiers)  # type: ignore[arg-type]
-    assert not (tmp_path / "c").exists()
-
-
 def test_drawn_lab_is_described_by_the_cases_models() -> None:
-    """The calibrated models miss the noise-free lab and null field by a third of the noise."""
     rng = np.random.default_rng(12)
     drawn = [case for case in (try_case(rng, "hard", "none") for _ in range(6)) if case]
     assert drawn

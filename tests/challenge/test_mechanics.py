@@ -16,13 +16,11 @@ from tests.challenge.realities import conditions, reality, sandy_loam
 
 
 def test_contact_lengths_are_the_measured_ones() -> None:
-    """Static deflection at 18, 30 and 42 psi and 5 kN."""
     got = Tyre().contact_length(np.array([18.0, 30.0, 42.0]) * PSI_KPA, np.full(3, 5.0))
     assert got == pytest.approx([0.26656, 0.20159, 0.15943], rel=1e-9)
 
 
 def test_ground_pressure_is_load_over_area() -> None:
-    """The three values that follow from the measured contact."""
     got = average_ground_pressure(np.array([18.0, 30.0, 42.0]) * PSI_KPA, np.full(3, 5.0))
     assert got == pytest.approx([106.577, 140.925, 178.192], abs=2e-3)
 
@@ -30,7 +28,6 @@ def test_ground_pressure_is_load_over_area() -> None:
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 10**6), load=st.floats(2.0, 7.0), slipping=st.booleans())
 def test_vertical_forces_balance(seed: int, load: float, slipping: bool) -> None:
-    """The soil carries the load, whatever the soil, load, pressure and slip."""
     rng = np.random.default_rng(seed)
     soil = draw_soil(rng, slip_sinkage=slipping)
     slip, inflation = rng.uniform(-0.05, 0.75, 20), rng.uniform(100.0, 320.0, 20)
@@ -40,7 +37,6 @@ def test_vertical_forces_balance(seed: int, load: float, slipping: bool) -> None
 
 
 def test_pull_vanishes_at_recorded_zero_slip() -> None:
-    """Slip counts from the self-propelled point at every pressure."""
     inflation = np.array([110.0, 150.0, 200.0, 300.0])
     recorded = conditions(4, slip=0.0, inflation_kpa=inflation)
     assert simulate(reality(), recorded)["drawbar_pull"] == pytest.approx(np.zeros(4), abs=1e-6)
@@ -49,7 +45,6 @@ def test_pull_vanishes_at_recorded_zero_slip() -> None:
 
 
 def test_pull_and_rut_resemble_the_source() -> None:
-    """Pull rises steeply and saturates; ruts of a few centimetres grow with slip."""
     got = simulate(reality(), conditions(29))
     pull, rut = got["drawbar_pull"], got["rut_depth"]
     assert 0.4 < pull.max() < 2.0
@@ -61,7 +56,6 @@ def test_pull_and_rut_resemble_the_source() -> None:
 @settings(max_examples=20, deadline=None)
 @given(factor=st.floats(1.05, 3.0), slip=st.floats(0.05, 0.7))
 def test_pull_grows_with_cohesion(factor: float, slip: float) -> None:
-    """A more cohesive soil gives more thrust and sinks less."""
     zero = np.full(1, 0.01)
     at = conditions(1, slip=slip)
     weak = simulate(reality(), at, zero)
@@ -73,7 +67,6 @@ def test_pull_grows_with_cohesion(factor: float, slip: float) -> None:
 @settings(max_examples=20, deadline=None)
 @given(load=st.floats(2.0, 7.0), more=st.floats(0.2, 3.0))
 def test_rut_grows_with_load(load: float, more: float) -> None:
-    """A heavier wheel leaves a deeper rut."""
     light, heavy = (
         simulate(reality(), conditions(5, load_kn=each))["rut_depth"]
         for each in (load, load + more)
@@ -82,7 +75,6 @@ def test_rut_grows_with_load(load: float, more: float) -> None:
 
 
 def test_rut_grows_with_inflation() -> None:
-    """A harder tyre has a shorter contact and sinks deeper."""
     ruts = [
         simulate(reality(), conditions(3, inflation_kpa=p))["rut_depth"]
         for p in (120.0, 200.0, 290.0)
@@ -91,7 +83,6 @@ def test_rut_grows_with_inflation() -> None:
 
 
 def test_shear_is_odd_bounded_and_softens() -> None:
-    """Shear changes sign with displacement and never exceeds the Mohr-Coulomb strength."""
     soil = sandy_loam(residual=0.6, softening_m=0.03).columns(1)
     j = np.linspace(-0.3, 0.3, 61)[None, :]
     stress = shear_stress(soil, np.full((1, 61), 100.0), j)[0]
@@ -101,7 +92,6 @@ def test_shear_is_odd_bounded_and_softens() -> None:
 
 
 def test_solver_returns_ends_outside_the_bracket() -> None:
-    """Roots are found where they are inside, and the nearer end elsewhere."""
     shift = np.array([-2.0, 0.3, 5.0])
     got = solve_increasing(lambda x: x**3 - shift**3, np.full(3, -1.0), np.full(3, 1.0))
     assert got == pytest.approx([-1.0, 0.3, 1.0], abs=1e-6)
@@ -110,7 +100,6 @@ def test_solver_returns_ends_outside_the_bracket() -> None:
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 10**6), index=st.floats(200.0, 1500.0), water=st.floats(0.02, 0.09))
 def test_density_grows_with_cone_index_and_water(seed: int, index: float, water: float) -> None:
-    """The same cone index means a denser soil where less suction helps to resist the cone."""
     law = draw_cone_law(np.random.default_rng(seed))
     base = law.density(np.array([index]), np.array([water]))
     assert law.density(np.array([1.1 * index]), np.array([water])) > base

@@ -9,13 +9,15 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from calib.batch.folders import read_folder
 from calib.errors import CalibError
 from calib.inference.emulation import Emulation
-from calib.models import Model
+from calib.models import MODELS, Model
 from calib.models.simulators.registered import simulated_by
 from calib.report.numbers import finite
 
@@ -193,3 +195,26 @@ def simulators_of(models: Iterable[str]) -> dict[str, Any]:
     """Return what the results of a task depend on of simulators of the user's own."""
     found = {m: s.simulator.digest for m in models if (s := simulated_by(m)) is not None}
     return {"simulators": found} if found else {}
+
+
+@contextmanager
+def in_place(made: Sequence[Emulated]) -> Iterator[None]:
+    """Let models be their emulators, in this process and for this task."""
+    before = [MODELS[e.model.name] for e in made if e.model.name in MODELS]
+    try:
+        for e in made:
+            MODELS.discard(e.model.name)
+            MODELS.add(e.model)
+        yield
+    finally:
+        for e in made:
+            MODELS.discard(e.model.name)
+        for model in before:
+            MODELS.add(model)
+
+
+def files_of(write: Callable[[Path], object]) -> dict[str, bytes]:
+    """Return the files that a function writes into a folder."""
+    with TemporaryDirectory() as scratch:
+        write(Path(scratch))
+        return read_folder(Path(scratch))

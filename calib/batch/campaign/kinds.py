@@ -8,7 +8,7 @@ simulation-based calibration. Another kind is a table, three functions and a lin
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from itertools import product
@@ -29,11 +29,12 @@ from calib.batch.campaign.kind import (
     Task,
     Work,
     emulation_file,
+    files_of,
+    in_place,
     simulators_of,
     word,
 )
 from calib.batch.environment import from_the_bench, source_sha256
-from calib.batch.folders import read_folder
 from calib.data import Table
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
@@ -50,7 +51,7 @@ from calib.inference.prior_files import default_priors, prior_file_model
 from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
 from calib.inference.sampling.sampler import SamplerSettings
-from calib.models import MODELS, get_model
+from calib.models import get_model
 from calib.models.simulators.emulator import emulator_of, save_emulator
 from calib.models.simulators.registered import slow_simulator
 from calib.report.page.diagnosis import write_page
@@ -61,13 +62,6 @@ from calib.validation.sbc import SETTINGS, chosen_models
 from calib.validation.validate import validate_held_out
 
 SHIPPED, NOTHING = "shipped", "nothing"  # in a list of prior files, and of rows to hold out
-
-
-def _files_of(write: Callable[[Path], object]) -> dict[str, bytes]:
-    """Return the files that a function writes into a folder."""
-    with TemporaryDirectory() as scratch:
-        write(Path(scratch))
-        return read_folder(Path(scratch))
 
 
 # Fits
@@ -195,7 +189,7 @@ def _fit(item: FitItem, seed: int) -> Work:
     if posterior:
         # How long it took stands elsewhere: without it, equal posteriors are equal files.
         timeless = replace(calibration, draws=replace(calibration.draws, seconds=0.0))
-        run = _files_of(lambda folder: _keep_run(timeless, judged, folder))
+        run = files_of(lambda folder: _keep_run(timeless, judged, folder))
         files |= {f"run/{name}": data for name, data in run.items()}
     if emulation is not None:
         numbers["converged"] = report.passed and emulation.numbers["passed"]
@@ -288,11 +282,11 @@ def _load_diagnosis(task: Task) -> DiagnosisItem:
 def _diagnose(item: DiagnosisItem, seed: int) -> Work:
     """Diagnose a case, as `calib diagnose` does."""
     case, effects, page, made = item
-    with _effects(effects) as own, _in_place(made):
+    with _effects(effects) as own, in_place(made):
         found = diagnose(case, seed, effects={**EFFECTS, **own})
         files: dict[str, str | bytes] = {**written(found, effects)}
         if page:
-            files |= _files_of(lambda folder: write_page(found, folder, {"seed": seed}))
+            files |= files_of(lambda folder: write_page(found, folder, {"seed": seed}))
     numbers = diagnosis_numbers(found)
     if case.label:
         numbers["data_label"] = case.label
@@ -302,25 +296,9 @@ def _diagnose(item: DiagnosisItem, seed: int) -> Work:
         numbers["emulator"] = {e.model.name: e.numbers for e in made}
         files |= emulation_file(made)
         # To predict from the diagnosis.
-        kept = _files_of(lambda folder: _keep_emulators(made, folder))
+        kept = files_of(lambda folder: _keep_emulators(made, folder))
         files |= {f"emulators/{name}": data for name, data in kept.items()}
     return numbers, files
-
-
-@contextmanager
-def _in_place(made: Sequence[Emulated]) -> Iterator[None]:
-    """Let models be their emulators, in this process and for this task."""
-    before = [MODELS[e.model.name] for e in made if e.model.name in MODELS]
-    try:
-        for e in made:
-            MODELS.discard(e.model.name)
-            MODELS.add(e.model)
-        yield
-    finally:
-        for e in made:
-            MODELS.discard(e.model.name)
-        for model in before:
-            MODELS.add(model)
 
 
 def _keep_emulators(made: Sequence[Emulated], folder: Path) -> None:

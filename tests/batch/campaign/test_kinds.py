@@ -15,7 +15,6 @@ from calib.batch.campaign.kinds import KINDS
 from calib.check.check import check
 from calib.cli.gap import prepare_case
 from calib.data import hold_out, read_table
-from calib.errors import CalibError
 from calib.gap.batch import diagnose_cases
 from calib.gap.case import read_case
 from calib.gap.diagnose import diagnose
@@ -77,14 +76,6 @@ def test_a_replicate_is_that_of_the_verb(serial, tmp_path):
         assert numbers["converged"] is expected["converged"]
         for name, (rank, draws) in expected["ranks"].items():
             assert numbers["rank"][name] == rank / draws
-
-
-def test_a_replicate_of_no_model_is_refused(tmp_path):
-    plan = tmp_path / "plan.toml"
-    plan.write_text('[[sbc]]\nname = "a"\nsimulations = 1\ndraw_seed = 1\nmodels = ["bekkar"]\n')
-    with pytest.raises(CalibError, match="bekkar") as refused:
-        read_plan(plan)
-    assert "[[sbc]], models" in str(refused.value)
 
 
 def test_a_fit_is_that_of_the_verb(site, serial):

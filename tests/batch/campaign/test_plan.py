@@ -105,6 +105,7 @@ def test_an_effects_priors_are_in_its_class_or_beside_its_file(tmp_path, inside)
 
 
 FIT = '[[fit]]\nname = "a"\ndata = ["data/*.csv"]\nmodels = ["bekker"]\n'
+SBC = '[[sbc]]\nname = "a"\nsimulations = 1\ndraw_seed = 1\nmodels = ["bekkar"]\n'
 CASES = '[[challenge]]\nname = "a"\ndraw_seed = 1\n'
 
 
@@ -134,6 +135,7 @@ CASES = '[[challenge]]\nname = "a"\ndraw_seed = 1\n'
         (FIT.replace("[\"bekker", "[\"magic_formula\", \"bekker") + 'priors = ["soft.toml"]',
          ["no prior file is for bekker", "'shipped'"]),
         (FIT + 'hold_out = ["30 psi"]', ["[[fit]], hold_out", "'30 psi'", "COLUMN=VALUE"]),
+        (SBC, ["[[sbc]], models", "bekkar"]),
         ('[[diagnose]]\nname = "a"\ncases = ["data"]', ["no folder with a case.toml", "'data'"]),
         ('[[diagnose]]\nname = "a"\ncases = ["cases/*"]\neffects = "e.py"', ["no file 'e.py'"]),
         (CASES, ["cases is missing", "how many"]),
