@@ -717,17 +717,6 @@ def test_other_line_ends_are_no_difference_and_are_told() -> None:
     assert (changed.exit_code, "data.csv" in changed.output) == (1, True)
 
 
-@pytest.mark.slow
-def test_of_a_report_too() -> None:
-    words = ["report", "ruts.csv", "--model", "bekker", "--max-steps", "400", "--workers", "1"]
-    assert run(*words, "--out", "rep").exit_code == 0
-    to_windows(Path("rep"))
-    done = run("check", "rep", "--workers", "1")
-    assert done.exit_code == 0, done.output
-    assert done.stdout.startswith("SAME")
-    assert "other line ends" in done.output
-
-
 def test_a_run_that_is_doubled_in_a_table_is_named(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     columns = lab(rng)

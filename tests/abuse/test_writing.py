@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -260,30 +258,6 @@ def test_a_second_process_that_lands_results_is_refused(
     with another("alone", Path(inside)):
         said = refused(LANDING[verb], Path("out"))
     assert "another process is writing results to this folder" in said
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("verb", ["fit", "sbc"])
-def test_a_second_process_beside_a_real_one_is_refused(verb: str, tmp_path: Path) -> None:
-    words = {
-        "fit": "fit ruts.csv --model bekker --out out",
-        "sbc": LANDING["sbc"].replace("10", "300").replace("OUT", "out"),
-    }[verb]
-    sign = {"fit": ".out-????????", "sbc": "out/replicates/.landing"}[verb]
-    first = subprocess.Popen(
-        [sys.executable, "-c", "from calib.cli import main; main()", *words.split()],
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)},
-    )  # fmt: skip
-    try:
-        for _ in range(600):
-            if list(tmp_path.glob(sign)):
-                break
-            time.sleep(0.05)
-        assert "another process is" in refused(words, Path("out"))
-    finally:
-        os.killpg(first.pid, signal.SIGKILL)
-        first.wait()
 
 
 def test_a_claim_that_came_to_nothing_leaves_nothing(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -30,6 +31,68 @@ def refusal(out: Path, *, overwrite: bool = False) -> str:
     assert str(out) in str(early.value)
     assert "hint:" in str(early.value)
     return str(early.value)
+
+
+def thesis(place: Path) -> Path:
+    (place / "thesis").mkdir()
+    (place / "thesis" / "chapter1.tex").write_text("years of work")
+    return place / "thesis"
+
+
+def beside_ours(place: Path) -> Path:
+    (thesis(place) / "run.json").write_text("{}")
+    return place / "thesis"
+
+
+def below_a_file(place: Path) -> Path:
+    (place / "file").write_text("x")
+    return place / "file" / "deeper" / "run"
+
+
+@pytest.mark.parametrize(
+    ("arrange", "said"),
+    [
+        (thesis, "was not written by calib"),
+        (beside_ours, "holds files that calib did not write: chapter1.tex"),
+        (lambda place: below_a_file(place).parents[1], "is an existing file"),
+        (below_a_file, "file is a file"),
+        (lambda place: place / ("x" * 300), "cannot be written"),
+        (lambda place: place, "is the current folder"),
+    ],
+)
+def test_what_may_not_be_replaced_is_refused_and_stays(
+    arrange: Callable[[Path], Path], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    out = arrange(tmp_path)
+    before = contents(tmp_path)
+    assert said in refusal(out, overwrite=True)
+    assert contents(tmp_path) == before
+
+
+def test_without_permission_or_room_it_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = shutil.disk_usage(tmp_path)._replace(free=2_000_000)
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "disk_usage", lambda path: usage)
+        assert "only 2.0 MB are left on its disk" in refusal(tmp_path / "run")
+    # The superuser may write anywhere, so the answer is put in the system's mouth.
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    assert "no permission to write" in refusal(tmp_path / "run")
+
+
+def test_an_earlier_result_is_replaced_only_on_request_and_an_empty_folder_is_used(
+    tmp_path: Path,
+) -> None:
+    out = tmp_path / "run"
+    out.mkdir()
+    with fresh_folder(out) as folder:
+        (folder / "manifest.json").write_text("old")
+    assert "pass --overwrite" in refusal(out)
+    with fresh_folder(out, overwrite=True) as folder:
+        (folder / "new").write_text("x")
+    assert contents(tmp_path) == {"run", "run/new"}
 
 
 def test_a_folder_appears_once_the_block_succeeds(tmp_path: Path) -> None:
@@ -83,13 +146,6 @@ def test_of_two_that_write_at_a_time_neither_is_lost(tmp_path: Path) -> None:
     assert texts == {"away": "quicker", "run": "quicker", "run-2": "slower", "run-3": "slowest"}
 
 
-def test_an_empty_folder_is_used(tmp_path: Path) -> None:
-    (tmp_path / "run").mkdir()
-    with fresh_folder(tmp_path / "run") as folder:
-        (folder / "a").write_text("x")
-    assert contents(tmp_path) == {"run", "run/a"}
-
-
 @pytest.mark.parametrize("earlier", [False, True])
 def test_of_a_link_the_folder_that_it_names_is_written(tmp_path: Path, earlier: bool) -> None:
     """It was taken for a folder that another process had written meanwhile, or was replaced."""
@@ -115,49 +171,6 @@ def test_a_mount_point_is_refused_before_the_work(tmp_path: Path, monkeypatch) -
     for kept in (fresh_folder(out), fresh_folder(out, overwrite=True), claimed(out)):
         with pytest.raises(CalibError, match="is a mount point"), kept:
             pytest.fail("the work began")
-
-
-def test_an_earlier_result_is_replaced_only_on_request(tmp_path: Path) -> None:
-    out = tmp_path / "run"
-    out.mkdir()
-    (out / "manifest.json").write_text("old")
-    assert "pass --overwrite" in refusal(out)
-    with fresh_folder(out, overwrite=True) as folder:
-        (folder / "new").write_text("x")
-    assert contents(tmp_path) == {"run", "run/new"}
-
-
-def test_a_folder_of_something_else_is_never_replaced(tmp_path: Path) -> None:
-    out = tmp_path / "thesis"
-    out.mkdir()
-    (out / "chapter1.tex").write_text("years of work")
-    assert "was not written by calib" in refusal(out, overwrite=True)
-    assert (out / "chapter1.tex").read_text() == "years of work"
-
-
-def test_a_file_is_no_folder(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("x")
-    assert "is an existing file" in refusal(tmp_path / "file", overwrite=True)
-
-
-def test_a_path_below_a_file_is_refused_before_the_work(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("x")
-    message = refusal(tmp_path / "file" / "deeper" / "run")
-    assert "cannot be written" in message
-    assert f"{tmp_path / 'file'} is a file" in message
-    assert contents(tmp_path) == {"file"}
-
-
-def test_a_name_that_is_too_long_is_refused(tmp_path: Path) -> None:
-    assert "cannot be written" in refusal(tmp_path / ("x" * 300))
-
-
-def test_a_folder_without_permission_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # The superuser may write anywhere, so the answer is put in the system's mouth.
-    monkeypatch.setattr(os, "access", lambda path, mode: False)
-    assert "no permission to write" in refusal(tmp_path / "run")
 
 
 KILLED = """
@@ -227,13 +240,6 @@ def test_the_only_copy_of_an_earlier_result_is_not_removed(tmp_path: Path) -> No
     assert mine.exists()
 
 
-def test_the_current_folder_cannot_be_replaced(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert "is the current folder" in refusal(Path())
-
-
 def test_a_disk_that_fills_up_is_one_line(tmp_path, monkeypatch):
     def full(path, content):
         raise OSError(errno.ENOSPC, "No space left on device", str(path))
@@ -245,15 +251,6 @@ def test_a_disk_that_fills_up_is_one_line(tmp_path, monkeypatch):
     ):
         (scratch / "summary.json").write_bytes(b"{}")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_other_errors_of_the_system_are_not_taken_for_a_full_disk(tmp_path):
+    # Other errors of the system are not taken for a full disk.
     with pytest.raises(FileNotFoundError), fresh_folder(tmp_path / "out"):
-        (tmp_path / "nowhere" / "file").write_bytes(b"")
-
-
-def test_a_disk_with_nothing_left_is_found_before_the_work(tmp_path, monkeypatch):
-    usage = shutil.disk_usage(tmp_path)._replace(free=2_000_000)
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage)
-    with pytest.raises(CalibError, match=r"only 2\.0 MB are left on its disk"):
-        check_folder(tmp_path / "out")
+        (tmp_path / "nowhere" / "file").read_bytes()

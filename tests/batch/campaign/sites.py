@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -83,15 +81,6 @@ def make_site(folder: Path, plan: str = PLAN) -> Path:
         write_case(case, folder / "cases" / f"case-{i}")
     (folder / "plan.toml").write_text(plan)
     return folder / "plan.toml"
-
-
-def start(plan: Path, out: Path, *options: str) -> subprocess.Popen[str]:
-    """Start a campaign in a process of its own, as the shell would."""
-    command = [sys.executable, "-c", "from calib.cli import main; main()", "campaign"]
-    return subprocess.Popen(
-        [*command, str(plan), "--out", str(out), *options],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
 
 
 def content(out: Path) -> dict[str, bytes]:

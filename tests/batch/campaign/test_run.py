@@ -4,20 +4,15 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import shutil
-import signal
-import time
-from contextlib import suppress
 from pathlib import Path
 
-import psutil
 import pytest
 
 from calib.batch.campaign import read_plan, run_campaign
 from calib.batch.campaign import run as run_module
 from calib.errors import CalibError
-from tests.batch.campaign.sites import N_CASES, NAMES, content, make_site, results, start
+from tests.batch.campaign.sites import N_CASES, NAMES, content, make_site, results
 
 CASES_ONLY = '[[diagnose]]\nname = "sites"\ncases = ["cases/*"]\n'
 
@@ -55,47 +50,6 @@ def test_each_kind_has_a_table(serial):
 def test_two_workers_write_the_same_bytes(site, serial, tmp_path):
     run_campaign(read_plan(site), tmp_path / "two", workers=2)
     assert content(tmp_path / "two") == content(serial)
-
-
-@pytest.mark.slow
-def test_a_killed_worker_and_a_killed_client_lose_nothing(site, serial, tmp_path):
-    out = tmp_path / "out"
-    client = start(site, out, "--workers", "2")
-    kill_a_worker(client.pid, until=lambda: (out / "results").exists())
-    wait_for(lambda: len(results(out)) >= 2, client)
-    os.kill(client.pid, signal.SIGKILL)
-    client.communicate()
-    there = {n: (out / "results" / n).stat().st_mtime_ns for n in results(out)}
-    assert 2 <= len(there) < len(NAMES)
-    again = start(site, out, "--workers", "2")
-    kill_a_worker(again.pid, after_seconds=0.0)  # as it starts, before it has met the scheduler
-    said = again.communicate(timeout=120)
-    assert again.returncode == 0, said
-    assert {n: (out / "results" / n).stat().st_mtime_ns for n in there} == there
-    assert content(out) == content(serial)
-
-
-def wait_for(condition, process) -> None:
-    while not condition():
-        assert process.poll() is None, process.communicate()
-        time.sleep(0.005)
-
-
-def kill_a_worker(client: int, until=lambda: True, after_seconds: float = 0.5) -> None:
-    """Kill the first worker of a client that has computed for so long."""
-    deadline = time.monotonic() + 60.0
-    while time.monotonic() < deadline:
-        for child in psutil.Process(client).children():
-            # One that ends just now cannot be asked any more.
-            with suppress(psutil.NoSuchProcess):
-                busy = "spawn_main" in " ".join(child.cmdline()) and (
-                    child.cpu_times().user >= after_seconds
-                )
-                if busy and until():
-                    child.kill()
-                    return
-        time.sleep(0.005)
-    raise AssertionError("no worker was seen")
 
 
 def test_nothing_is_done_twice(site, serial, tmp_path, monkeypatch):
