@@ -18,7 +18,7 @@ from calib.cli.app import app
 from calib.errors import CalibError
 from calib.models import example_csv
 from challenge.seal import KEY_SCHEMA, publish, seal
-from tests.gap.cases import make_case, write_case
+from tests.gap.cases import PULL_ONLY, make_case, write_case
 
 PLAN = """
 [[fit]]
@@ -61,7 +61,9 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     Path("ruts.csv").write_text(example_csv("bekker"), encoding="utf-8")
     Path("plan.toml").write_text(PLAN, encoding="utf-8")
     cases = Path("cases")
-    write_case(make_case("force_offset", n_lab=15, n_field=12), cases / "case-000")
+    write_case(
+        make_case("force_offset", models=PULL_ONLY, n_lab=15, n_field=12), cases / "case-000"
+    )
     truth = {"tier": "easy", "truth": "force_offset", "gap_over_noise": 3.0}
     key = {"schema": KEY_SCHEMA, "seed": 1, "salt": "", "cases": {"case-000": truth}}
     publish(cases, key, seal(key, Path("sealed.json")), ("easy",))
@@ -127,7 +129,9 @@ def full(tmp_path: Path) -> Iterator[Path]:
 
 def refused(words: str, out: Path) -> str:
     """Run a command that must be refused; return the one line that says why."""
-    done: Result = CliRunner().invoke(app, words.replace("OUT", str(out)).split())
+    done: Result = CliRunner().invoke(
+        app, [word.replace("OUT", str(out)) for word in words.split()]
+    )
     assert done.exit_code == 2, (done.output, done.exception)
     lines = done.stderr.splitlines()
     assert lines[0].startswith("calib: "), lines
@@ -231,33 +235,33 @@ def contents(folder: Path) -> set[str]:
     return {p.relative_to(folder).as_posix() for p in folder.rglob("*")}
 
 
-@pytest.mark.parametrize("verb", [v for v in AT_ONCE if v != "predict"])
 def test_a_second_process_on_a_folder_is_refused_before_the_work(
-    verb: str, tmp_path: Path, no_work: None
+    tmp_path: Path, no_work: None
 ) -> None:
     out = tmp_path / "out"
     with another("claimed", out):
         before = contents(tmp_path)
-        said = refused(AT_ONCE[verb], out)
-        assert "another process is working on this output folder" in said
-        assert contents(tmp_path) == before
+        for verb in set(AT_ONCE) - {"predict"}:
+            said = refused(AT_ONCE[verb], out)
+            assert "another process is working on this output folder" in said, verb
+            assert contents(tmp_path) == before
     # It was killed, and what it held is free at once.
     assert "another process" not in refused(AT_ONCE["fit"], out)
 
 
-@pytest.mark.parametrize(("verb", "inside"), [
-    ("sbc", "out/replicates"), ("campaign", "out/results"), ("run", "out"), ("make", "out"),
-    ("well-specified", "out"),
-])  # fmt: skip
 def test_a_second_process_that_lands_results_is_refused(
-    verb: str, inside: str, no_work: None, monkeypatch: pytest.MonkeyPatch
+    no_work: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # That the folder is not empty is another reason, told first.
     monkeypatch.setattr("calib.validation.sbc._claim", lambda *_: None)
     monkeypatch.setattr("calib.batch.campaign.run.check_folder", lambda *_: None)
-    with another("alone", Path(inside)):
-        said = refused(LANDING[verb], Path("out"))
-    assert "another process is writing results to this folder" in said
+    inside = {"sbc": "replicates", "campaign": "results", "run": "", "make": "",
+              "well-specified": ""}  # fmt: skip
+    for folder in dict.fromkeys(inside.values()):
+        with another("alone", Path(f"out of {folder}", folder)):
+            for verb in (verb for verb, its in inside.items() if its == folder):
+                said = refused(LANDING[verb], Path(f"out of {folder}"))
+                assert "another process is writing results to this folder" in said, verb
 
 
 def test_a_claim_that_came_to_nothing_leaves_nothing(tmp_path: Path) -> None:
