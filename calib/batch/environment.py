@@ -8,12 +8,13 @@ set, for several add up in another order; and no floating-point errors.
 from __future__ import annotations
 
 import hashlib
+import platform
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
-from importlib import import_module
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -81,9 +82,11 @@ class Environment:
     def differences(self, other: Environment) -> dict[str, tuple[str, str]]:
         """Return what differs, as pairs of this one's and the other's value."""
         mine, theirs = self._flat(), other._flat()
-        names = [*mine, *(name for name in theirs if name not in mine)]
-        pairs = {name: (mine.get(name, "none"), theirs.get(name, "none")) for name in names}
-        return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
+        return {
+            name: (mine.get(name, "none"), theirs.get(name, "none"))
+            for name in dict.fromkeys([*mine, *theirs])
+            if mine.get(name) != theirs.get(name)
+        }
 
     def same_program(self, other: Environment) -> bool:
         """Whether equal numbers must give equal files: the same code and packages.
@@ -99,19 +102,10 @@ class Environment:
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and of the packages that numbers depend on."""
-    return {"python": sys.version.split()[0], **{name: _version(name) for name in _PACKAGES}}
-
-
-@cache
-def _version(package: str) -> str:
-    from importlib.metadata import version
-
-    return version(package)
+    return {"python": sys.version.split()[0], **{name: version(name) for name in _PACKAGES}}
 
 
 def _machine() -> dict[str, str]:
-    import platform
-
     import numpy as np
 
     config: Any = np.show_config(mode="dicts")
@@ -210,6 +204,8 @@ def blas_kernels() -> list[str]:
 
 @cache
 def _libraries() -> Any:
-    # SciPy brings a library of its own, which has to be there to be told.
-    import_module("scipy.linalg")
-    return import_module("threadpoolctl").ThreadpoolController()
+    # SciPy brings a library of its own, which is found only once it is loaded.
+    import scipy.linalg  # noqa: F401
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()
