@@ -27,11 +27,11 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
 import calib
 from calib.gap.case import Case
+from calib.inference.design import prior_design
 from calib.inference.emulation import EmulationSettings, emulate
 from calib.inference.emulation.prepared import prepare, prepare_field
 from calib.inference.emulation.state import State
 from calib.inference.problem import Problem
-from calib.inference.trial import prior_design
 from calib.models.simulators.registered import SIMULATED
 from calib.models.simulators.runs import RunKeeper
 

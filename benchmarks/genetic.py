@@ -21,9 +21,9 @@ from shared.measure import spread
 
 from calib.data import Table, hold_out
 from calib.he2019.designs import he2019_tasks
-from calib.inference.estimators.genetic import estimate_genetic
-from calib.inference.estimators.search import PointEstimate, estimate_differential_evolution
+from calib.inference.estimators import estimate_genetic
 from calib.inference.problem import Problem, build_problem
+from calib.inference.search import PointEstimate, estimate_differential_evolution
 
 SEEDS = 20
 # A final cost is the optimum's if it exceeds it by less than this part.

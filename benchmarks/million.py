@@ -24,7 +24,7 @@ from shared.machine import describe
 from calib.inference.calibration import calibrate
 from calib.inference.diagnostics import ess
 from calib.inference.problem import Problem
-from calib.inference.sampling.proposal import StudentT
+from calib.inference.proposal import StudentT
 from calib.models.base import Array
 
 _DRAWS, _DOF, _WIDER = 600, 12.0, 1.1

@@ -38,8 +38,8 @@ ROOT = Path(__file__).resolve().parents[1]
 OUT = ROOT / "out" / "mutation"
 AREAS = {
     "models": ("models/*.py",),
-    "likelihood": ("inference/likelihood.py", "inference/noise.py"),
-    "gate": ("inference/diagnostics.py", "inference/sampling/gate.py"),
+    "likelihood": ("inference/likelihood.py",),
+    "gate": ("inference/diagnostics.py",),
     "gap": ("gap/*.py", "gap/effects/*.py"),
 }
 # Tests of a module besides `test_MODULE.py`, by the start of its path.
@@ -50,7 +50,7 @@ ALSO = {
     "models/magic_formula": "inference/estimators/test_genetic.py report/test_study.py",
     "models/wong_reece": "models/test_rigid_wheel.py",
     "inference/likelihood": "inference/test_problem.py inference/test_conjugate.py",
-    "inference/diagnostics": "inference/sampling/test_gate.py inference/sampling/test_walk.py "
+    "inference/diagnostics": "inference/sampling/test_gate.py "
     "report/test_posterior_text.py validation/test_sensitivity.py",
     "gap/effects/": "gap/test_effect_equations.py gap/test_effects.py gap/test_forward.py "
     "gap/test_load_effects.py gap/test_declared.py gap/test_which.py",

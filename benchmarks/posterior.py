@@ -26,7 +26,7 @@ from shared.peers import pymc_model
 from calib.he2019.designs import he2019_tasks
 from calib.inference.diagnostics import Gate, ess
 from calib.inference.problem import Problem, build_problem
-from calib.inference.sampling.sampler import SamplerSettings, sample_posterior
+from calib.inference.sampler import SamplerSettings, sample_posterior
 from calib.models.base import Array
 
 # Draws of each sampler: its defaults, and so many that what comes before them is of no account.

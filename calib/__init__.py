@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from calib.inference.estimators import PointEstimate, estimate
     from calib.inference.io import load_calibration, save_calibration, to_datatree
     from calib.inference.problem import Problem, build_problem
-    from calib.inference.sampling.sampler import SamplerSettings
+    from calib.inference.sampler import SamplerSettings
     from calib.models import MODELS, Model
     from calib.models.simulators.files import read_simulator
     from calib.models.simulators.registered import from_callable
@@ -72,7 +72,7 @@ _HOME = {
     "check": "calib.check.check",
     "Comparison": "calib.validation.comparison",
     "compare": "calib.validation.comparison",
-    "SamplerSettings": "calib.inference.sampling.sampler",
+    "SamplerSettings": "calib.inference.sampler",
     "load_calibration": "calib.inference.io",
     "save_calibration": "calib.inference.io",
     "to_datatree": "calib.inference.io",

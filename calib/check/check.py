@@ -35,9 +35,20 @@ from calib.data.files import inside, read_json
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration
-from calib.inference.io import describe_estimates, estimate_again, recompute_run, run_problem
+from calib.inference.io import (
+    DATA,
+    POSTERIOR,
+    PRIORS,
+    RUN,
+    Record,
+    RunRecord,
+    describe_estimates,
+    estimate_again,
+    read_record,
+    recompute_run,
+    run_problem,
+)
 from calib.inference.problem import Problem, build_problem
-from calib.inference.record import DATA, POSTERIOR, PRIORS, RUN, Record, RunRecord, read_record
 from calib.models import get_model
 from calib.report import comparison
 from calib.report.comparison import (

@@ -47,9 +47,8 @@ from calib.data import files
 from calib.data.files import inside
 from calib.errors import FAULTS, CalibError
 from calib.inference.calibration import moments
-from calib.inference.io import DRAWN, DrawsFile, read_draws, read_netcdf
+from calib.inference.io import DRAWN, POSTERIOR, RUN, DrawsFile, read_draws, read_netcdf
 from calib.inference.problem import Problem
-from calib.inference.record import POSTERIOR, RUN
 from calib.models.base import Array
 from calib.report.comparison import FILE as COMPARISON
 from calib.report.study import Progress

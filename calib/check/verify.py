@@ -28,8 +28,7 @@ from calib.data.quantities import OUTPUTS
 from calib.data.reader import KNOWN_DATA, label_of
 from calib.errors import FAULTS, CalibError
 from calib.gap.files import mispredicted, misquoted
-from calib.inference.prior_files import default_priors
-from calib.inference.record import (
+from calib.inference.io import (
     Entry,
     File,
     Hash,
@@ -39,6 +38,7 @@ from calib.inference.record import (
     RunRecord,
     read_record,
 )
+from calib.inference.prior_files import default_priors
 from calib.report.comparison import FOLDER as COMPARED
 from calib.report.comparison import ComparisonRecord
 from calib.report.sections import SECTIONS

@@ -240,7 +240,7 @@ def compare(
 
     from calib.batch.folders import claimed, drop, fresh_folder, keep
     from calib.inference.prior_files import prior_file_model
-    from calib.inference.sampling.sampler import SamplerSettings
+    from calib.inference.sampler import SamplerSettings
     from calib.models import get_model
     from calib.report.comparison import text, write_comparison
     from calib.report.study_tasks import HoldOut, read_and_split

@@ -17,8 +17,8 @@ from calib.gap.constants import ONSET_WIDTH, RADIUS_ERROR, RIPPLES, SHIFT_DIFFER
 from calib.gap.effects import View
 from calib.gap.effects.base import each
 from calib.gap.hypotheses import SETTINGS, Hypothesis, ShiftAs
+from calib.inference.mode import prior_widths
 from calib.inference.prior_files import default_priors
-from calib.inference.sampling.mode import prior_widths
 from calib.models.base import Array
 
 # Another zero of slip: unit of the relative error of the rolling radius.

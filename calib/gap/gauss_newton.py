@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from calib.gap.campaigns import Campaigns
 from calib.gap.forward import Forward, fields_of_all
 from calib.gap.noise import Noise, ln_averaged, most_probable
-from calib.inference.sampling.mode import prior_widths
+from calib.inference.mode import prior_widths
 from calib.models.base import Array
 
 

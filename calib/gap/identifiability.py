@@ -25,8 +25,8 @@ from calib.gap.fit import Fit
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import Hypothesis
 from calib.gap.noise import Noise, noise_conditions
+from calib.inference.mode import hessian_scale, prior_widths
 from calib.inference.random import generator
-from calib.inference.sampling.mode import hessian_scale, prior_widths
 from calib.models.base import Array
 
 _NOTHING = 1e-6  # noise sds

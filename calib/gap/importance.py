@@ -43,8 +43,8 @@ from calib.gap.constants import PLENTY
 from calib.gap.fit import Fit
 from calib.gap.forward import FieldPrediction
 from calib.gap.gauss_newton import Residuals
+from calib.inference.proposal import StudentT, log_sum, tempered_moments
 from calib.inference.random import generator
-from calib.inference.sampling.proposal import StudentT, log_sum, tempered_moments
 from calib.models.base import Array
 
 

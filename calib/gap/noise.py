@@ -14,7 +14,7 @@ from calib.data import Table
 from calib.data.quantities import columns_of
 from calib.gap.constants import KAPPA, LN_KAPPA_PRIOR, LN_RHO_PRIOR, RHO
 from calib.gap.effects import View
-from calib.inference.sampling.proposal import log_sum
+from calib.inference.proposal import log_sum
 from calib.models.base import Array
 
 

@@ -37,9 +37,9 @@ from calib.gap.odds import (
     with_prior,
 )
 from calib.gap.search import StartingPoints, search_sets, unusually_large
-from calib.inference.estimators.search import check_defined
+from calib.inference.mode import find_mode
 from calib.inference.random import generator
-from calib.inference.sampling.mode import find_mode
+from calib.inference.search import check_defined
 from calib.models.base import Array
 
 

@@ -26,8 +26,8 @@ from typing import NamedTuple
 import numpy as np
 
 from calib.errors import CalibError
-from calib.inference.estimators.search import PointEstimate, goodness, sum_of_squares
 from calib.inference.problem import Problem
+from calib.inference.search import PointEstimate, goodness, sum_of_squares
 from calib.models.base import Array
 
 _FEWEST_LEVELS = 4

@@ -37,9 +37,9 @@ from calib.he2019 import declared
 from calib.he2019.embedded import load_he2019
 from calib.he2019.published import LABEL, PUBLISHED
 from calib.he2019.reconstruction import SLIP_SHIFT
+from calib.inference.mode import find_modes
+from calib.inference.proposal import Guess, adapt
 from calib.inference.random import generator
-from calib.inference.sampling.mode import find_modes
-from calib.inference.sampling.proposal import Guess, adapt
 from calib.models.base import Array
 from calib.models.bekker import rut_depth as eq_21
 from calib.report.study import Progress

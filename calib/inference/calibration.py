@@ -12,12 +12,8 @@ from calib.inference.diagnostics import convergence, ess, hdi, hdi_error, median
 from calib.inference.estimators import PointEstimate
 from calib.inference.problem import Problem
 from calib.inference.random import stream
-from calib.inference.sampling.sampler import Draws, Progress, SamplerSettings, sample_posterior
+from calib.inference.sampler import Draws, Progress, SamplerSettings, sample_posterior
 from calib.models.base import Array
-
-_HDI = 0.95
-# Parts of each ensemble's steps whose scatter gives Monte Carlo errors.
-_PARTS = 4
 
 
 @dataclass(frozen=True)
@@ -125,7 +121,7 @@ def _summarise(calibration: Calibration) -> dict[str, ParameterSummary]:
     mean_ess = ess(stacked, "mean")
     flat = stacked.reshape(-1, len(names))
     batches = _batches(stacked.reshape(ensembles, walkers, steps, -1))
-    interval_error = [hdi_error(batches[j], _HDI) for j in range(len(names))]
+    interval_error = [hdi_error(batches[j], 0.95) for j in range(len(names))]
     prior_sd = _prior_sds(calibration)
     return {
         name: ParameterSummary(
@@ -147,7 +143,7 @@ def _summarise(calibration: Calibration) -> dict[str, ParameterSummary]:
 
 def moments(draws: Array) -> dict[str, float]:
     """Return what a summary says of draws (n,) in whatever order they came."""
-    low, high = hdi(draws, _HDI)
+    low, high = hdi(draws, 0.95)
     return {
         "mean": float(draws.mean()),
         "sd": float(draws.std(ddof=1)),
@@ -160,7 +156,7 @@ def moments(draws: Array) -> dict[str, float]:
 def _batches(draws: Array) -> Array:
     """Draws (ensembles, walkers, steps, d) in consecutive parts of every ensemble, (d, g, m)."""
     ensembles, walkers, steps, d = draws.shape
-    parts = max(1, min(_PARTS, steps // 2))
+    parts = max(1, min(4, steps // 2))
     kept = draws[:, :, : parts * (steps // parts)].reshape(ensembles, walkers, parts, -1, d)
     return np.asarray(kept.transpose(4, 0, 2, 1, 3).reshape(d, ensembles * parts, -1))
 

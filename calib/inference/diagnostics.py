@@ -137,10 +137,6 @@ def rank_scatter(effective: float) -> float:
     return float(1.96 * np.sqrt((N_BINS - 1.0) / max(effective, 1.0)))
 
 
-# A positive parameter whose interval spans this factor is looked at by its logarithm.
-_WIDE = 4.0
-
-
 def distances(
     draws: Array, values: Array, interval: tuple[float, float]
 ) -> tuple[Array, Array, bool]:
@@ -150,7 +146,7 @@ def distances(
     value without one has the distance NaN.
     """
     low, high = interval
-    log = bool(low > 0.0 and high > _WIDE * low)
+    log = bool(low > 0.0 and high > 4.0 * low)
     with np.errstate(invalid="ignore", divide="ignore"):
         to = np.log if log else np.asarray
         t, x = to(draws[draws > 0.0] if log else draws), to(np.asarray(values, dtype=float))

@@ -1,41 +1,53 @@
-"""Sums of squared residuals of many parameter vectors: the work of every likelihood.
+"""How measurements scatter about their prediction, and what many parameter vectors make of them.
 
-Rows taken at the same conditions share their prediction mu. Of m such rows with mean m_y,
+The sum of squared residuals. Rows taken at the same conditions share their prediction mu. Of m such
+rows with mean m_y,
 
     sum (y - mu)^2 = sum (y - m_y)^2 + m (m_y - mu)^2,
 
-so the model is evaluated once per distinct condition, whatever the number of rows. What is left
-is worked through in tiles, some rows times some vectors, that stay in the processor's cache and
-bound the memory. Each tile's part is summed on its own, so the number of threads does not change
-a digit of the result.
+so the model is evaluated once per distinct condition. What is left is worked through in tiles, some
+rows times some vectors, that stay in the processor's cache and bound the memory. Each tile's part
+is summed on its own, so the number of threads does not change a digit of the result.
 
-The density of residuals where the prediction itself is known with an error.
-
-The noise is independent, the prediction's error is shared by the rows: a few curves B, (n, j),
-times independent normals of one variance v. So the residuals r are normal with the covariance
-sigma^2 I + v B B'. With B'B = U diag(d) U', the same for all parameters, and a = U'B'r,
+The density where the prediction is known with an error, a few curves B, (n, j), times independent
+normals of one variance v. Residuals r are normal with the covariance sigma^2 I + v B B'. With
+B'B = U diag(d) U', the same for all parameters, and a = U'B'r,
 
     ln N = -n ln sigma - 1/2 sum_i ln(1 + v d_i / sigma^2) - n/2 ln 2 pi
            - (r'r - sum_i a_i^2 v / (sigma^2 + v d_i)) / (2 sigma^2)
+
+The noise. By default it is normal of one standard deviation sigma. A prior file may ask for
+
+- Student-t noise: sigma is its scale, and the degrees of freedom nu are inferred;
+- a noise that depends on a condition c: ln sigma(c) = ln sigma + sigma_slope (c - m)/s, with m and
+  s the mean and the sd of the condition over the rows that are calibrated on;
+- normal noise that is correlated along a run: readings that are k apart have the correlation rho^k,
+  an autoregression of order one, of which rows may be missing (Box, Jenkins & Reinsel 2008, Time
+  Series Analysis, section 3.2). Different runs are independent. Each row depends on the others
+  through its two neighbours alone (Bürkner, Gabry & Vehtari 2021, doi:10.1007/s00180-020-01045-4).
+
+Natural parameters are those of the model, then nu, sigma_slope and rho if they are there, then
+sigma.
 """
 
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln, ndtr, ndtri, stdtr, stdtrit
 
+from calib.data import Table
+from calib.data.quantities import QUANTITIES
+from calib.errors import CalibError
+from calib.inference.constants import HALF_LN_2PI, PARALLEL_CELLS, SHORT_TILE, TILE_CELLS
 from calib.models.base import Array, BoundModel, Conditions, Rows, columns
-
-# Cells (rows times vectors) of a tile: a few arrays of doubles in a processor's cache.
-_TILE_CELLS = 65_536
-# Up to this many rows are one tile, in their order.
-_SHORT = 256
-# Cells from which a second thread is worth starting.
-_PARALLEL_CELLS = 4_000_000
 
 
 @dataclass(frozen=True)
@@ -86,7 +98,7 @@ class Squares:
         def work(i: int) -> None:
             _evaluate(self.bound, self.tiles[i], theta, sums[i])
 
-        if self.threads > 1 and theta.shape[0] * self.n_distinct >= _PARALLEL_CELLS:
+        if self.threads > 1 and theta.shape[0] * self.n_distinct >= PARALLEL_CELLS:
             with ThreadPoolExecutor(self.threads) as pool:
                 list(pool.map(work, range(len(self.tiles))))
         else:
@@ -103,7 +115,7 @@ def _processors() -> int:
 
 def _evaluate(bound: BoundModel, tile: _Tile, theta: Array, out: Array) -> None:
     """Write each vector's sum of squares over a tile's rows."""
-    at_once = max(1, _TILE_CELLS // tile.response.size)
+    at_once = max(1, TILE_CELLS // tile.response.size)
     # Threads have their own error state. Bad vectors come out as NaN.
     with np.errstate(all="ignore"):
         for i in range(0, theta.shape[0], at_once):
@@ -137,7 +149,7 @@ def _distinct(
         code = np.unique(code * values.size + inverse, return_inverse=True)[1]
     count = np.bincount(code)
     if count.size == n:
-        order = np.argsort(code) if n > _SHORT else np.arange(n)
+        order = np.argsort(code) if n > SHORT_TILE else np.arange(n)
         return {name: v[order] for name, v in conditions.items()}, response[order], None, 0.0
     first = np.empty(count.size, dtype=np.intp)
     first[code[::-1]] = np.arange(n)[::-1]
@@ -152,16 +164,16 @@ def _blocks(distinct: Conditions, n: int) -> list[slice]:
 
     There the equation may work out per value what it would otherwise do per row.
     """
-    if n <= _SHORT:
+    if n <= SHORT_TILE:
         return [slice(0, n)]
     few = min(distinct.values(), key=lambda v: np.unique(v).size)
     edges = np.flatnonzero(np.diff(few)) + 1
-    if edges.size * _SHORT > n:
+    if edges.size * SHORT_TILE > n:
         edges = edges[:0]
     cuts = [0]
     for edge in [*edges.tolist(), n]:
         length = edge - cuts[-1]
-        parts = -(-length // _TILE_CELLS)
+        parts = -(-length // TILE_CELLS)
         cuts += [cuts[-1] + length * (j + 1) // parts for j in range(parts)]
     return [slice(a, b) for a, b in pairwise(cuts)]
 
@@ -185,3 +197,286 @@ def log_normal(residuals: Array, variance: Array, curves: Array, sigma: Array) -
     value = -residuals.shape[1] * (np.log(scale) + 0.5 * np.log(2.0 * np.pi))
     value -= 0.5 * (np.log(grown).sum(axis=1) + (squares - taken) / scale**2)
     return np.where(bad, np.nan, value)
+
+
+type Family = Literal["normal", "student_t"]
+type Along = Literal["", "run_order"]
+
+
+# Read where a prior file chooses a noise and says nothing of its parameters.
+DEFAULT_PRIORS = """
+[nu]
+dist = "gamma"
+shape = 2.0
+rate = 0.1
+lower = 1.0
+unit = "1"
+reason = "From tails as heavy as Cauchy's, below which a prediction has no mean, to nearly normal"
+source = "Juarez & Steel (2010), doi:10.1198/jbes.2009.07145"
+
+[rho]
+dist = "uniform"
+lower = 0.0
+upper = 0.99
+unit = "1"
+reason = "From independent rows to a noise that hardly changes in a hundred rows"
+source = "This project: nothing is preferred"
+
+[sigma_slope]
+dist = "normal"
+mean = 0.0
+sd = 0.5
+unit = "1"
+reason = "Over conditions that are evenly spread, noise that changes by a factor of 1/6 to 6"
+source = "This project: weak, and as ready to fall as to grow"
+"""
+
+
+@dataclass(frozen=True)
+class NoiseChoice:
+    """What a prior file says of the noise.
+
+    It may depend on a quantity, or its canonical column; empty for one scale at all conditions. In
+    runs neighbours may be correlated; what they are counted in, or empty for independent rows.
+    """
+
+    family: Family = "normal"
+    depends_on: str = ""
+    correlated_along: Along = ""
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the noise's parameters beside sigma."""
+        there = {
+            "nu": self.family == "student_t", "sigma_slope": self.depends_on,
+            "rho": self.correlated_along,
+        }  # fmt: skip
+        return tuple(name for name, asked in there.items() if asked)
+
+    @property
+    def usual(self) -> bool:
+        """Whether it is normal of one standard deviation."""
+        return not self.parameters
+
+
+USUAL = NoiseChoice()
+
+
+@dataclass(frozen=True)
+class Noise:
+    """A choice of noise on some data.
+
+    Of the condition that the scale depends on, if any: its mean and sd over the calibrated rows.
+    """
+
+    choice: NoiseChoice = USUAL
+    column: str = ""
+    centre: float = 0.0
+    spread: float = 1.0
+
+    @property
+    def usual(self) -> bool:
+        """Whether it is normal of one standard deviation."""
+        return self.choice.usual
+
+    def must_be_usual(self, source: str, what: str) -> None:
+        """Raise a CalibError unless usual, for what is worked out for the usual noise alone."""
+        if not self.usual:
+            raise CalibError(
+                f"{what} takes normal noise of one standard deviation only",
+                where=f"{source}, [likelihood]",
+                hint="take this table out, and fit again what was fitted with it",
+            )
+
+    @property
+    def student(self) -> bool:
+        """Whether it is Student's."""
+        return self.choice.family == "student_t"
+
+    def scale(self, natural: Array, conditions: Mapping[str, Array]) -> Array:
+        """Return the scale at conditions: natural parameters (k, d_all) to (k, 1) or (k, n)."""
+        sigma = natural[:, -1:]
+        if not self.column:
+            return sigma
+        z = (conditions[self.column] - self.centre) / self.spread
+        # What exceeds all bounds is for the density to exclude.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.asarray(sigma * np.exp(self.own("sigma_slope", natural) * z))
+
+    def own(self, name: str, natural: Array) -> Array:
+        """Return a parameter of the noise's own beside sigma, shape (k, 1)."""
+        names = self.choice.parameters
+        j = natural.shape[1] - 1 - len(names) + names.index(name)
+        return natural[:, j : j + 1]
+
+    def draw(
+        self, natural: Array, conditions: Mapping[str, Array], rng: np.random.Generator, n: int
+    ) -> Array:
+        """Draw the noise of n readings for each parameter vector, shape (k, n)."""
+        z = rng.standard_normal((natural.shape[0], n))
+        if self.student:
+            nu = self.own("nu", natural)
+            z *= np.sqrt(nu / rng.chisquare(np.broadcast_to(nu, z.shape)))
+        return self.scale(natural, conditions) * z
+
+    def of_normal(self, natural: Array, conditions: Mapping[str, Array], z: Array) -> Array:
+        """Return the noise at the quantiles of standard normals z, (k, 1) to (k, 1) or (k, n)."""
+        if self.student:
+            # From the tail, where a probability near one would be rounded to it.
+            z = -np.sign(z) * stdtrit(self.own("nu", natural), ndtr(-np.abs(z)))
+        return np.asarray(self.scale(natural, conditions) * z)
+
+    def log_density(
+        self, residuals: Array, natural: Array, conditions: Mapping[str, Array]
+    ) -> Array:
+        """Log density of residuals (k, n), each by itself; NaN where a residual is."""
+        with np.errstate(all="ignore"):
+            scale = self.scale(natural, conditions)
+            z = residuals / scale
+            if not self.student:
+                return np.asarray(-0.5 * z * z - np.log(scale) - HALF_LN_2PI)
+            nu = self.own("nu", natural)
+            half = 0.5 * (nu + 1.0)
+            constant = gammaln(half) - gammaln(0.5 * nu) - 0.5 * np.log(np.pi * nu)
+            return np.asarray(constant - np.log(scale) - half * np.log1p(z * z / nu))
+
+    def normal_scores(
+        self, residuals: Array, natural: Array, conditions: Mapping[str, Array]
+    ) -> Array:
+        """Residuals (k, n) as they would stand in standard normal noise: of the same quantile."""
+        z = residuals / self.scale(natural, conditions)
+        if not self.student:
+            return np.asarray(z)
+        return np.asarray(-np.sign(z) * ndtri(stdtr(self.own("nu", natural), -np.abs(z))))
+
+
+NORMAL = Noise()
+
+
+def noise_of(choice: NoiseChoice, conditions: Conditions, source: str) -> Noise:
+    """Return a choice of noise on the rows, (n,), that are calibrated on.
+
+    Raises
+    ------
+    CalibError
+        If the noise is to depend on what is no condition of the model, or does not vary.
+    """
+    if not choice.depends_on:
+        return Noise(choice)
+    stems = {QUANTITIES[name].stem: name for name in conditions}
+    column = ({name: name for name in conditions} | stems).get(choice.depends_on)
+    where = f"{source}, [likelihood] noise_depends_on"
+    if column is None:
+        raise CalibError(
+            f"the noise is to depend on {choice.depends_on!r}, which is no condition of the model",
+            where=where, expected=", ".join(stems), hint="name one of these",
+        )  # fmt: skip
+    values = conditions[column]
+    spread = float(values.std())
+    if not spread > 1e-9 * float(np.abs(values).max()):
+        raise CalibError(
+            f"the noise is to depend on {QUANTITIES[column].word}, which is the same in all rows "
+            "that are fitted",
+            where=where, expected="a condition that varies", hint="leave noise_depends_on out",
+        )  # fmt: skip
+    return Noise(choice, column, float(values.mean()), spread)
+
+
+@dataclass(frozen=True)
+class Serial:
+    """Rows in the order in which they were measured.
+
+    Parameters
+    ----------
+    order : ndarray of int, shape (n,)
+        Rows of the table, run by run.
+    gap : ndarray, shape (n,)
+        How far each of these is from the one before; infinite for the first of a run.
+    """
+
+    order: NDArray[np.intp]
+    gap: Array
+
+    def before(self, z: Array, rho: Array) -> tuple[Array, Array]:
+        """Mean and variance of each row given those before it, (k, n), in the rows' order.
+
+        Parameters
+        ----------
+        z : ndarray, shape (k, n)
+        rho : ndarray, shape (k, 1)
+        """
+        r, along = self._correlations(rho), z[:, self.order]
+        mean = np.zeros_like(along)
+        mean[:, 1:] = r[:, 1:] * along[:, :-1]
+        return self._back(mean), self._back(1.0 - r * r)
+
+    def given_all_others(self, z: Array, rho: Array) -> tuple[Array, Array]:
+        """Mean and variance of each row given all others, (k, n), in the rows' order."""
+        r, along = self._correlations(rho), z[:, self.order]
+        after = np.column_stack([r[:, 1:], np.zeros(len(r))])
+        left, right = 1.0 - r * r, 1.0 - after * after
+        precision = 1.0 / left + after * after / right
+        mean = np.zeros_like(along)
+        mean[:, 1:] += (r / left)[:, 1:] * along[:, :-1]
+        mean[:, :-1] += (after / right)[:, :-1] * along[:, 1:]
+        return self._back(mean / precision), self._back(1.0 / precision)
+
+    def correlate(self, z: Array, rho: Array) -> Array:
+        """Turn independent standard normals (k, n) into noise that is correlated."""
+        r, along = self._correlations(rho), z[:, self.order]
+        for i in range(1, along.shape[1]):
+            own = np.sqrt(1.0 - r[:, i] ** 2)
+            along[:, i] = r[:, i] * along[:, i - 1] + own * along[:, i]
+        return self._back(along)
+
+    def _correlations(self, rho: Array) -> Array:
+        """Correlation of each row with the one before, (k, n)."""
+        return np.asarray(rho**self.gap)
+
+    def _back(self, along: Array) -> Array:
+        out = np.empty_like(along)
+        out[:, self.order] = along
+        return out
+
+
+def serial_of(along: Along, table: Table) -> Serial | None:
+    """Return the order of a table's rows; None where they are independent.
+
+    Parameters
+    ----------
+    along : {"", "run_order"}
+        That column, in each ``run`` by itself where the table has this one. Rows that are missing
+        leave a gap.
+
+    Raises
+    ------
+    CalibError
+        If there is no such column, or it does not say the order.
+    """
+    if not along:
+        return None
+    if along not in table:
+        raise CalibError(
+            f"the noise is to be correlated along {along}, a column that is not there",
+            where=table.source, expected=f"a column {along}",
+            hint="add the column, with whole numbers in the order of the measurement",
+        )  # fmt: skip
+    place, n = table[along], len(table)
+    run = table["run"] if "run" in table else np.zeros(n)
+    order = np.lexsort((place, run)).astype(np.intp)
+    gap = np.full(n, np.inf)
+    gap[1:] = np.where(np.diff(run[order]) == 0.0, np.diff(place[order]), np.inf)
+    # An empty cell is neither.
+    wrong = np.flatnonzero(~(gap >= 1.0))
+    if wrong.size:
+        lines = sorted(table.lines[row] for row in order[np.union1d(wrong, wrong - 1)])
+        raise CalibError(
+            f"{table.header_of(along)} does not say in which order the rows of a run were "
+            f"measured: see line{'s' if len(lines) > 1 else ''} "
+            f"{', '.join(map(str, lines[:8]))}"
+            f"{' and others' if len(lines) > 8 else ''}",
+            where=table.source,
+            expected="a whole number in every row, another one for each row of a run",
+            hint="number the rows of each run as they were measured, and label the runs (run)",
+        )  # fmt: skip
+    return Serial(order, gap)

@@ -18,7 +18,7 @@ from calib.batch.user_code import declared_in
 from calib.data.files import MEND_TOML, read_text
 from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError, in_words, meant
-from calib.inference.noise import DEFAULT_PRIORS, USUAL, Along, Family, NoiseChoice
+from calib.inference.likelihood import DEFAULT_PRIORS, USUAL, Along, Family, NoiseChoice
 from calib.inference.priors import Prior, Priors
 from calib.models import MODELS
 

@@ -18,13 +18,10 @@ from numpy.typing import NDArray
 from scipy.special import gammainc, gammaincinv, gammaln, log_ndtr, ndtr, ndtri, ndtri_exp
 
 from calib.errors import CalibError
-from calib.inference.noise import USUAL, NoiseChoice
+from calib.inference.likelihood import USUAL, NoiseChoice
 from calib.models.base import Array
 
 type Mask = NDArray[np.bool_]
-
-# Below it a probability has lost digits, or is zero, in double precision; its logarithm is not.
-_LEAST_MASS = 1e-290
 
 
 @dataclass(frozen=True)
@@ -153,7 +150,8 @@ class Priors:
             below, above = ndtr(a), ndtr(b)
             u_left = np.where(swap, 1.0 - u, u)
             z = ndtri(below + u_left * (above - below))
-            if (tail := above < _LEAST_MASS).any():
+            # So small a probability has lost digits, or is zero; its logarithm is not.
+            if (tail := above < 1e-290).any():
                 z[:, tail] = _in_tail(a[tail], b[tail], u_left[:, tail])
             normals = loc + scale * np.where(swap, -z, z)
             uniforms = lower + u * (upper - lower)

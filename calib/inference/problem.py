@@ -9,7 +9,7 @@ deviation sigma,
     ln L = -n ln sigma - SSE(theta)/(2 sigma^2) - (n/2) ln 2 pi  [- sum ln y for a log response],
 
 the bracket making it a density of the output itself, so that models can be compared. A prior file
-may ask for other noise (`calib.inference.noise`), which is evaluated row by row. Where the
+may ask for other noise (`calib.inference.likelihood`), which is evaluated row by row. Where the
 prediction has an error of its own, that of an emulator, its covariance over the rows is added to
 that of the noise (`calib.inference.likelihood`).
 """
@@ -28,8 +28,16 @@ from calib.data.files import plain_number
 from calib.data.quantities import QUANTITIES
 from calib.data.table import accepted_headers
 from calib.errors import CalibError
-from calib.inference.likelihood import Squares, log_normal
-from calib.inference.noise import NORMAL, Noise, Serial, noise_of, serial_of
+from calib.inference.constants import CHUNK_CELLS, HALF_LN_2PI
+from calib.inference.likelihood import (
+    NORMAL,
+    Noise,
+    Serial,
+    Squares,
+    log_normal,
+    noise_of,
+    serial_of,
+)
 from calib.inference.prior_files import (
     PriorFile,
     default_priors,
@@ -40,15 +48,6 @@ from calib.inference.priors import Priors, prior_references
 from calib.inference.random import generator
 from calib.models import Array, BoundModel, Conditions, get_model
 from calib.models.simulators.registered import simulated_by
-
-# Draws of the prior, and the rows that they are looked at in.
-_DRAWS, _ROWS = 2_000, 50
-# The size of a column is that which all but its largest tenth have: one slip of the pen is none.
-_SIZE = 0.9
-# Part of the draws on either side that is no evidence against an assumed scale.
-_TAIL = 5e-4
-# An order of magnitude.
-_FAR = 10.0
 
 
 def check_scale(problem: Problem, assumed: Mapping[str, float]) -> None:
@@ -66,8 +65,8 @@ def check_scale(problem: Problem, assumed: Mapping[str, float]) -> None:
     """
     low, high = _expected(problem)
     column = problem.table.column(problem.bound.model.output)
-    size = float(np.quantile(np.abs(problem.observed), _SIZE))
-    slack = 1.0 if assumed else _FAR
+    size = float(np.quantile(np.abs(problem.observed), 0.9))
+    slack = 1.0 if assumed else 10.0
     # Of a column of zeros the size tells nothing.
     if not np.isfinite([low, high]).all() or low / slack <= size <= high * slack or size == 0.0:
         return
@@ -109,28 +108,24 @@ def _taken(name: str, value: float) -> str:
 def _expected(problem: Problem) -> tuple[float, float]:
     """Return between which values the priors expect the size of the output."""
     table = problem.table
-    rows = np.linspace(0, len(table) - 1, min(len(table), _ROWS)).astype(np.int64)
+    rows = np.linspace(0, len(table) - 1, min(len(table), 50)).astype(np.int64)
     some = problem.with_table(table.take(rows))
     rng = generator(0, "scale of the priors")
     with np.errstate(all="ignore"):
-        natural = some.theta(some.priors.sample(rng, _DRAWS))
+        natural = some.theta(some.priors.sample(rng, 2_000))
         drawn = some.draw_mean_response(natural, some.conditions, rng) + some.draw_noise(
             natural, rng
         )
-        sizes = np.quantile(np.abs(some.bound.from_response(drawn)), _SIZE, axis=1)
+        sizes = np.quantile(np.abs(some.bound.from_response(drawn)), 0.9, axis=1)
     sizes = sizes[np.isfinite(sizes)]
-    if sizes.size < _DRAWS / 2:
+    if sizes.size < 1_000:
         return np.nan, np.nan
-    low, high = np.quantile(sizes, [_TAIL, 1.0 - _TAIL])
+    low, high = np.quantile(sizes, [5e-4, 1.0 - 5e-4])
     return float(low), float(high)
 
 
 # Mean and variance of each row given others.
 type _Given = Callable[[Serial, Array, Array], tuple[Array, Array]]
-
-_HALF_LN_2PI = 0.5 * float(np.log(2.0 * np.pi))
-# Rows times vectors that are worked out at once where each row has a density of its own.
-_CELLS = 200_000
 
 
 @dataclass(frozen=True)
@@ -263,7 +258,7 @@ class Problem:
                 value = self._log_likelihood_by_row(natural)
             else:
                 sse = self.squares(self.of_model(natural))
-                value = -n * (np.log(sigma) + _HALF_LN_2PI) - 0.5 * sse / sigma**2
+                value = -n * (np.log(sigma) + HALF_LN_2PI) - 0.5 * sse / sigma**2
         value += self._sum_ln_jacobian
         return np.where(np.isfinite(value), value, -np.inf)
 
@@ -277,7 +272,7 @@ class Problem:
         return self.response - location, unknown, curves
 
     def _log_likelihood_by_row(self, natural: Array) -> Array:
-        at_once = max(1, _CELLS // self.response.size)
+        at_once = max(1, CHUNK_CELLS // self.response.size)
         value = np.empty(len(natural))
         for i in range(0, len(natural), at_once):
             some = natural[i : i + at_once]
@@ -295,7 +290,7 @@ class Problem:
             z = residuals / scale
             mean, variance = given(serial, z, self.noise.own("rho", natural))
             squared = (z - mean) ** 2 / variance
-            return -0.5 * (squared + np.log(variance)) - np.log(scale) - _HALF_LN_2PI
+            return -0.5 * (squared + np.log(variance)) - np.log(scale) - HALF_LN_2PI
 
     def log_likelihood_left_out(self, t: Array) -> Array:
         """Log density of every row given all others and the parameters, shape (k, n)."""
@@ -320,7 +315,7 @@ class Problem:
         residuals, unknown, curves = self._predicted(natural)
         sigma = np.sqrt(natural[:, -1:] ** 2 + unknown[:, None] * (curves**2).sum(axis=1))
         z = residuals / sigma
-        return np.asarray(-0.5 * z * z - np.log(sigma) - _HALF_LN_2PI + self._ln_jacobian)
+        return np.asarray(-0.5 * z * z - np.log(sigma) - HALF_LN_2PI + self._ln_jacobian)
 
     def log_prob(self, t: Array) -> Array:
         """Log posterior density (unnormalised) of internal coordinates, shape (k,)."""

@@ -24,10 +24,20 @@ from calib.data import read_for_model, write_table
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration
-from calib.inference.io import load_calibration, run_problem, save_calibration
+from calib.inference.io import (
+    Entry,
+    File,
+    Hash,
+    KnownModel,
+    Record,
+    RunRecord,
+    load_calibration,
+    read_record,
+    run_problem,
+    save_calibration,
+)
 from calib.inference.problem import Problem, build_problem
-from calib.inference.record import Entry, File, Hash, KnownModel, Record, RunRecord, read_record
-from calib.inference.sampling.sampler import SamplerSettings
+from calib.inference.sampler import SamplerSettings
 from calib.models import get_model
 from calib.models.base import Array
 from calib.report.figures.plate import mark

@@ -14,7 +14,7 @@ import numpy as np
 
 from calib.inference.calibration import Calibration, ParameterSummary
 from calib.inference.estimators import PointEstimate
-from calib.inference.noise import Noise
+from calib.inference.likelihood import Noise
 from calib.models import Model, get_model
 from calib.models.base import Array
 from calib.report.labels import Axis, axis_of, units_of

@@ -25,7 +25,7 @@ from calib.inference.io import save_calibration
 from calib.inference.prior_files import default_priors
 from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
-from calib.inference.sampling.sampler import SamplerSettings
+from calib.inference.sampler import SamplerSettings
 from calib.models import get_model
 from calib.models.base import Array
 from calib.report.study_tasks import Task, fitted_rows

@@ -24,9 +24,9 @@ import numpy as np
 from calib.data import Table
 from calib.data.quantities import output_of, role_of
 from calib.inference.calibration import Calibration
+from calib.inference.io import RUN
 from calib.inference.problem import Problem
 from calib.inference.random import generator
-from calib.inference.record import RUN
 from calib.models.base import Array
 from calib.report.labels import axis_of, joined, percent, plain, short, units_of
 from calib.report.rows import Result, held_table, signs_along, x_column

@@ -18,7 +18,7 @@ from calib.data.files import read_text
 from calib.inference.estimators import GeneticSettings
 from calib.inference.io import save_posterior
 from calib.inference.prior_files import default_priors
-from calib.inference.sampling.sampler import SamplerSettings
+from calib.inference.sampler import SamplerSettings
 from calib.models import get_model
 from calib.models.simulators.emulator import emulator_of, save_emulator
 from calib.report.document import summarise

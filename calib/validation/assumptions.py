@@ -20,8 +20,7 @@ from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration
 from calib.inference.diagnostics import distances
-from calib.inference.estimators import PointEstimate
-from calib.inference.estimators.least_squares import estimate_least_squares
+from calib.inference.estimators import PointEstimate, estimate_least_squares
 from calib.inference.problem import Problem
 from calib.inference.random import generator
 from calib.models.base import Array

@@ -22,10 +22,10 @@ from calib.errors import CalibError
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import estimate
 from calib.inference.io import save_calibration
-from calib.inference.noise import NORMAL, USUAL, Noise
+from calib.inference.likelihood import NORMAL, USUAL, Noise
 from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
-from calib.inference.sampling.sampler import Progress, SamplerSettings
+from calib.inference.sampler import Progress, SamplerSettings
 from calib.models import get_model
 from calib.models.base import Array
 from calib.validation.validate import Validation, leave_one_out, validate_held_out

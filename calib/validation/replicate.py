@@ -23,12 +23,12 @@ from calib.errors import CalibError
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.emulation import Emulation
 from calib.inference.emulation.prepared import emulated
-from calib.inference.emulation.settings import EmulationSettings
+from calib.inference.emulation.state import EmulationSettings
 from calib.inference.estimators import estimate
 from calib.inference.prior_files import PriorFile
 from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
-from calib.inference.sampling.sampler import Draws, SamplerSettings
+from calib.inference.sampler import Draws, SamplerSettings
 from calib.models import Model, example_csv, get_model
 from calib.models.base import Array, Conditions, not_given
 from calib.models.simulators.registered import Simulated as SlowSimulator

@@ -20,8 +20,8 @@ from calib.data import Table
 from calib.data.checks import source_of, word_of
 from calib.data.files import plain_number
 from calib.data.quantities import OUTPUTS, QUANTITIES
+from calib.inference.mode import find_modes
 from calib.inference.problem import Problem
-from calib.inference.sampling.mode import find_modes
 from calib.models.base import Array
 
 # Chance that any test of a family fails on rows and priors that are as assumed.

@@ -36,7 +36,7 @@ from calib.data.files import read_text
 from calib.errors import CalibError
 from calib.inference.prior_files import DeclaredPriors, prior_file_model
 from calib.inference.random import generator
-from calib.inference.sampling.sampler import SamplerSettings
+from calib.inference.sampler import SamplerSettings
 from calib.models import MODELS, get_model
 from calib.models.base import Array
 from calib.models.simulators.registered import slow_simulator

@@ -21,7 +21,7 @@ from calib.inference.calibration import Calibration
 from calib.inference.diagnostics import mcse, psis, tail_shape
 from calib.inference.problem import Problem
 from calib.inference.random import generator, stream
-from calib.inference.sampling.sampler import Progress, SamplerSettings, sample_posterior
+from calib.inference.sampler import Progress, SamplerSettings, sample_posterior
 from calib.models.base import Array
 from calib.validation.prediction import N_DRAWS, predictive_draws
 from calib.validation.scores import LEVELS, RELATIVE_ERROR_FAR, Scores, crps, score

@@ -8,8 +8,8 @@ from result_schemas import RESULTS
 
 from calib.batch.campaign.kinds import KINDS
 from calib.check.verify import Manifest
+from calib.inference.io import RunRecord
 from calib.inference.prior_files import PriorFileContent
-from calib.inference.record import RunRecord
 from calib.models.simulators.files import SimulatorFile
 from calib.report.comparison import ComparisonRecord
 

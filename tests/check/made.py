@@ -25,7 +25,7 @@ from calib.inference.estimators import estimate
 from calib.inference.io import save_calibration
 from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
-from calib.inference.sampling.sampler import SamplerSettings
+from calib.inference.sampler import SamplerSettings
 from calib.models import example_csv
 from calib.report.comparison import write_comparison
 from calib.report.figures.bands import bands_plate

@@ -19,7 +19,7 @@ from calib.check.outcome import Status
 from calib.errors import CalibError
 from calib.he2019.designs import he2019_tasks
 from calib.inference.prior_files import default_priors
-from calib.inference.sampling.sampler import SamplerSettings
+from calib.inference.sampler import SamplerSettings
 from calib.report.sections import work_out
 from calib.report.writer import write_report
 from tests.check.conftest import different, edit_json, findings, seal

@@ -16,7 +16,7 @@ from calib.errors import CalibError
 from calib.inference.calibration import calibrate
 from calib.inference.io import load_calibration, save_calibration
 from calib.inference.problem import build_problem
-from calib.inference.sampling.sampler import SamplerSettings
+from calib.inference.sampler import SamplerSettings
 from tests.check.conftest import different, edit_json, findings, seal_run
 from tests.check.made import SETTINGS, fitted_run
 

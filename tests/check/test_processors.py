@@ -13,8 +13,8 @@ import pytest
 
 from calib.check.check import check
 from calib.gap.forward import Forward
+from calib.inference import sampler as sampler_module
 from calib.inference.problem import Problem
-from calib.inference.sampling import sampler as sampler_module
 from tests.check.conftest import different
 from tests.check.kernels import ALL, KERNELS, Setting, skip_what_crashes
 

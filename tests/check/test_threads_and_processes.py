@@ -23,7 +23,7 @@ from calib.he2019.audit import Seeds, audit_json
 from calib.he2019.designs import he2019_tasks
 from calib.he2019.gaps import paper_gaps
 from calib.he2019.sections import AuditSection, GapsSection
-from calib.inference.sampling.sampler import SamplerSettings
+from calib.inference.sampler import SamplerSettings
 from calib.report.document import summarise
 from calib.report.sections import work_out
 from calib.report.study_tasks import Task

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from calib.errors import CalibError
-from calib.inference.sampling.sampler import SamplerSettings
+from calib.inference.sampler import SamplerSettings
 from calib.models import MODELS, example_csv
 from calib.validation.replicate import Item, replicate
 from tests.cli.test_cli import Calib

@@ -14,7 +14,7 @@ from calib.data import table_from_arrays
 from calib.errors import CalibError
 from calib.gap.case import Case
 from calib.inference.emulation import Emulation
-from calib.inference.emulation.settings import HeldOut
+from calib.inference.emulation.state import HeldOut
 from calib.models import MODELS
 from calib.models.simulators.base import Failure
 from calib.models.simulators.files import read_simulator

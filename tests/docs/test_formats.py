@@ -18,7 +18,7 @@ from pydantic import BaseModel, ValidationError
 
 from calib.data.quantities import QUANTITIES
 from calib.gap.effects import View
-from calib.inference.record import RunRecord
+from calib.inference.io import RunRecord
 from calib.models import example_csv
 from calib.models.simulators.files import SimulatorFile
 from tests.cli.test_cli import Calib

@@ -17,7 +17,7 @@ from calib.gap.hypotheses import singles
 from calib.gap.identifiability import identifiability, smallest_shown
 from calib.gap.noise import Noise
 from calib.gap.ranking import rank
-from calib.inference.sampling.mode import prior_widths
+from calib.inference.mode import prior_widths
 from tests.gap.cases import CHOICE, campaigns_of, make_case, ranking_of
 
 

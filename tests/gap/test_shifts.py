@@ -20,8 +20,8 @@ from calib.gap.forward import Forward
 from calib.gap.hypotheses import Hypothesis, singles
 from calib.gap.mixture import Mixture
 from calib.gap.noise import Noise
+from calib.inference.mode import prior_widths
 from calib.inference.prior_files import default_priors
-from calib.inference.sampling.mode import prior_widths
 from calib.models import MODELS as KNOWN
 from calib.report.page.diagnosis import shift_sizes
 from tests.gap.cases import MODELS, NOISE, PULL_ONLY, campaigns_of, make_case

@@ -38,7 +38,7 @@ from calib.he2019.gaps import (
 from calib.he2019.published import PUBLISHED
 from calib.he2019.sections import GapsSection, _withheld, check_text
 from calib.inference.calibration import calibrate
-from calib.inference.sampling.sampler import SamplerSettings
+from calib.inference.sampler import SamplerSettings
 from calib.models import get_model
 from calib.models.bekker import rut_depth as eq_21
 from calib.models.magic_formula import magic_formula

@@ -11,7 +11,7 @@ from calib.inference.calibration import Calibration, calibrate
 from calib.inference.diagnostics import ess
 from calib.inference.estimators import estimate
 from calib.inference.problem import build_problem
-from calib.inference.sampling.sampler import SamplerSettings
+from calib.inference.sampler import SamplerSettings
 
 CALIBRATIONS = pytest.mark.parametrize(
     "name", ["rut_calibration", "pull_calibration", "density_calibration"]

@@ -16,13 +16,12 @@ from scipy import stats
 from calib.data import table_from_arrays
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.diagnostics import ess
-from calib.inference.estimators.genetic import estimate_genetic
-from calib.inference.estimators.least_squares import estimate_least_squares
-from calib.inference.estimators.search import estimate_differential_evolution
+from calib.inference.estimators import estimate_genetic, estimate_least_squares
+from calib.inference.mode import find_modes
 from calib.inference.problem import Problem
-from calib.inference.sampling.mode import find_modes
-from calib.inference.sampling.proposal import Guess, adapt
-from calib.inference.sampling.sampler import fitted_moves, local_moves, run_walkers
+from calib.inference.proposal import Guess, adapt
+from calib.inference.sampler import fitted_moves, local_moves, run_walkers
+from calib.inference.search import estimate_differential_evolution
 from calib.validation.prediction import predict
 from calib.validation.validate import leave_one_out, validate_held_out
 from tests.custom_problems import fixed, normal, problem_of

@@ -18,7 +18,7 @@ from calib.inference import io
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.io import load_calibration, save_calibration, to_datatree
 from calib.inference.problem import build_problem
-from calib.inference.sampling.sampler import SamplerSettings
+from calib.inference.sampler import SamplerSettings
 from calib.models import MODELS
 from calib.validation.prediction import predict
 from calib.validation.validate import leave_one_out

@@ -90,7 +90,7 @@ def test_a_sum_does_not_depend_on_what_it_is_evaluated_with(
 ) -> None:
     bound, theta, conditions, response = data(name, 3, n)
     many = np.tile(theta, (40 if n > 1000 else 300, 1))
-    monkeypatch.setattr(module, "_TILE_CELLS", max(4096, n))
+    monkeypatch.setattr(module, "TILE_CELLS", max(4096, n))
     squares = Squares.of(bound, conditions, response)
     together = squares(many)
     # Other vectors may change the order of a sum, or Newton's last step of the implicit model.
@@ -102,7 +102,7 @@ def test_threads_make_no_difference(monkeypatch: pytest.MonkeyPatch) -> None:
     bound, theta, conditions, response = data("magic_formula_pressure", 4, 200_000)
     one, two = (Squares.of(bound, conditions, response, threads=t) for t in (1, 2))
     assert len(one.tiles) > 2
-    monkeypatch.setattr(module, "_PARALLEL_CELLS", 1)
+    monkeypatch.setattr(module, "PARALLEL_CELLS", 1)
     np.testing.assert_array_equal(one(theta), two(theta))
 
 
@@ -115,7 +115,7 @@ def test_memory_is_bounded_by_the_tile() -> None:
     squares(many)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert peak < 20 * 8 * module._TILE_CELLS < many.shape[0] * response.size * 8
+    assert peak < 20 * 8 * module.TILE_CELLS < many.shape[0] * response.size * 8
 
 
 def test_a_vector_without_a_value_does_not_touch_the_others() -> None:

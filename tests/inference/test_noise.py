@@ -17,7 +17,7 @@ from calib.inference.calibration import Calibration, calibrate
 from calib.inference.emulation.prepared import emulated
 from calib.inference.estimators import estimate, methods_for
 from calib.inference.io import load_calibration, save_calibration
-from calib.inference.noise import Noise, NoiseChoice
+from calib.inference.likelihood import Noise, NoiseChoice
 from calib.inference.prior_files import default_priors, parse_priors
 from calib.inference.problem import Problem, build_problem
 from calib.models import MODELS, example_csv, get_model

@@ -14,7 +14,7 @@ from calib.gap.case import case_from_run
 from calib.inference.calibration import calibrate
 from calib.inference.estimators import estimate
 from calib.inference.io import load_calibration, save_calibration
-from calib.inference.noise import serial_of
+from calib.inference.likelihood import serial_of
 from calib.inference.problem import Problem, build_problem
 from calib.validation.comparison import noise_words
 from calib.validation.replicate import design_of, simulate

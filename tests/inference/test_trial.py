@@ -11,8 +11,8 @@ import pytest
 
 import calib
 from calib.errors import CalibError
+from calib.inference.design import try_simulator
 from calib.inference.random import generator
-from calib.inference.trial import try_simulator
 from calib.models import MODELS
 from calib.models.simulators.registered import SIMULATED
 from tests.models.simulators.examples import PRIORS, lab, pull, serving, write_program
@@ -196,8 +196,8 @@ def test_a_simulator_that_hangs_is_spoken_of(monkeypatch: pytest.MonkeyPatch) ->
         said.append(text % of)
         spoken.set()
 
-    monkeypatch.setattr("calib.inference.trial._PATIENCE", 0.0)
-    monkeypatch.setattr("calib.inference.trial._log.warning", warn)
+    monkeypatch.setattr("calib.inference.design._PATIENCE", 0.0)
+    monkeypatch.setattr("calib.inference.design._log.warning", warn)
 
     def hanging(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
         assert spoken.wait(60.0)

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from calib.batch.environment import Environment
-from calib.inference.sampling.sampler import SamplerSettings
+from calib.inference.sampler import SamplerSettings
 from calib.report.document import summarise
 from calib.report.publish import Publication, publication
 from calib.report.sections import Report

@@ -11,7 +11,7 @@ from calib.he2019.audit import Seeds
 from calib.he2019.designs import he2019_tasks
 from calib.he2019.gaps import paper_gaps
 from calib.he2019.sections import AuditSection, GapsSection
-from calib.inference.sampling.sampler import SamplerSettings
+from calib.inference.sampler import SamplerSettings
 from calib.report.sections import work_out
 from calib.report.writer import file_hashes, write_report
 

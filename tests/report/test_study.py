@@ -19,7 +19,7 @@ from calib.he2019.designs import he2019_tasks
 from calib.he2019.embedded import load_he2019
 from calib.he2019.published import PUBLISHED
 from calib.inference.prior_files import default_priors
-from calib.inference.sampling.sampler import SamplerSettings
+from calib.inference.sampler import SamplerSettings
 from calib.report.document import summarise
 from calib.report.sections import Report, work_out
 from calib.report.study import Failure, OutputResult, Study

@@ -11,11 +11,11 @@ from scipy import stats
 
 from calib.data import Table, read_for_model, table_from_arrays
 from calib.inference.calibration import calibrate
-from calib.inference.noise import Noise, NoiseChoice
+from calib.inference.likelihood import Noise, NoiseChoice
+from calib.inference.mode import find_mode
 from calib.inference.priors import Priors
 from calib.inference.problem import Problem, build_problem
-from calib.inference.sampling.mode import find_mode
-from calib.inference.sampling.sampler import SamplerSettings
+from calib.inference.sampler import SamplerSettings
 from calib.models import MODELS, example_csv
 from calib.validation.assumptions import _cut_off, checks_of, file_remarks, remarks_of
 from calib.validation.residuals import (

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib.inference.calibration import Calibration, calibrate
-from calib.inference.noise import Noise, NoiseChoice
+from calib.inference.likelihood import Noise, NoiseChoice
 from calib.inference.priors import Priors
 from calib.inference.problem import Problem
 from calib.validation.comparison import NoisePreference, noise_preference, with_usual_noise

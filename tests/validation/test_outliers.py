@@ -10,8 +10,8 @@ from scipy import stats
 
 from calib.data.quantities import OUTPUTS
 from calib.he2019.designs import he2019_tasks
+from calib.inference.mode import find_mode
 from calib.inference.problem import Problem, build_problem
-from calib.inference.sampling.mode import find_mode
 from calib.validation.residuals import OUTLYING_LEVEL, linear, outlying_notes, outlying_rows
 from tests.custom_problems import normal, problem_of
 

@@ -10,7 +10,7 @@ from scipy import stats
 
 from calib.data import table_from_arrays
 from calib.inference.calibration import Calibration, calibrate
-from calib.inference.estimators.least_squares import estimate_least_squares
+from calib.inference.estimators import estimate_least_squares
 from calib.inference.priors import Prior
 from calib.inference.problem import Problem
 from calib.report.verdict import verdict

@@ -12,7 +12,7 @@ from calib.data import Table, table_from_arrays
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.problem import build_problem
-from calib.inference.sampling.sampler import SamplerSettings
+from calib.inference.sampler import SamplerSettings
 from calib.validation.validate import Validation, leave_one_out, validate_held_out
 
 N = 9

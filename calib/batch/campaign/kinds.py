@@ -50,7 +50,7 @@ from calib.inference.io import save_calibration
 from calib.inference.prior_files import default_priors, prior_file_model
 from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
-from calib.inference.sampling.sampler import SamplerSettings
+from calib.inference.sampler import SamplerSettings
 from calib.models import get_model
 from calib.models.simulators.emulator import emulator_of, save_emulator
 from calib.models.simulators.registered import slow_simulator

@@ -47,7 +47,7 @@ from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import PointEstimate, estimate
 from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
-from calib.inference.sampling.sampler import Progress
+from calib.inference.sampler import Progress
 from calib.models.base import Array
 from calib.models.bekker import rut_depth
 

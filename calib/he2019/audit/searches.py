@@ -32,11 +32,10 @@ from calib.he2019.audit.pull import READINGS, Signs, printed_signs, signs_text
 from calib.he2019.embedded import load_he2019
 from calib.he2019.published import Published
 from calib.he2019.reconstruction import SLIP_SHIFT
-from calib.inference.estimators import GeneticSettings, PointEstimate, estimate
-from calib.inference.estimators.genetic import minimise_genetic
-from calib.inference.estimators.search import hold_unidentified, search_space
+from calib.inference.estimators import GeneticSettings, PointEstimate, estimate, minimise_genetic
 from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
+from calib.inference.search import hold_unidentified, search_space
 from calib.models.base import Array
 from calib.report.study import Progress
 from calib.validation.scores import jeffreys

@@ -19,13 +19,11 @@ from calib.data.files import real_array
 from calib.data.reader import open_csv
 from calib.data.table import parse_header
 from calib.errors import CalibError
-from calib.inference.emulation.judge import judged, left_out
-from calib.inference.emulation.sequential import emulate, extend
-from calib.inference.emulation.settings import Emulation, EmulationSettings, Progress
-from calib.inference.emulation.state import State
+from calib.inference.design import check_moves, check_scale
+from calib.inference.emulation import emulate, extend, judged, left_out
+from calib.inference.emulation.state import Emulation, EmulationSettings, Progress, State
 from calib.inference.prior_files import PriorFile
 from calib.inference.problem import Problem, build_problem
-from calib.inference.trial import check_moves, check_scale
 from calib.models import get_model
 from calib.models.base import Array
 from calib.models.simulators.base import FAILED, Failure, Simulator
@@ -34,8 +32,6 @@ from calib.models.simulators.files import load_files
 from calib.models.simulators.registered import SIMULATED, Simulated, simulated_by, slow_simulator
 from calib.models.simulators.runs import Run, RunKeeper
 from calib.models.simulators.ways import TableWay, columns_of
-
-_LEAST = 8
 
 
 def emulate_table(
@@ -129,7 +125,7 @@ def _by_run(theta: Array, x: Mapping[str, Array], y: Array, path: Path) -> Train
     same = m * len(vectors) == len(y) and np.allclose(
         rows.reshape(len(vectors), m, -1), rows[:m], rtol=1e-9, atol=1e-12
     )
-    if not same or len(vectors) < _LEAST:
+    if not same or len(vectors) < 8:
         counts = np.bincount(of_run.ravel())
         odd = np.flatnonzero(counts != np.bincount(counts).argmax())[:1]
         told = "".join(
@@ -141,7 +137,7 @@ def _by_run(theta: Array, x: Mapping[str, Array], y: Array, path: Path) -> Train
             if not same
             else f"there are {len(vectors)} runs",
             where=str(path),
-            expected=f"at least {_LEAST} runs, each at the same rows of conditions",
+            expected="at least 8 runs, each at the same rows of conditions",
             hint="make the runs at the same conditions",
         )
     nodes = {name: rows[:m, i].copy() for i, name in enumerate(x)}
@@ -181,9 +177,6 @@ def _check_finite(
                 expected="a number for each parameter and condition; outputs may be missing",
                 hint="add it, or leave the run out",
             )  # fmt: skip
-
-
-_MORE = 100
 
 
 def emulated(
@@ -327,8 +320,9 @@ def _extended(
     progress: Progress | None,
 ) -> Emulation:  # fmt: skip
     settings = EmulationSettings(**(found.budget or {}))  # type: ignore[arg-type]
-    keeper = _keeper(found, workers, None, progress, _MORE)
-    return extend(emulator, problem, keeper, seed, settings=settings, more=_MORE, progress=progress)
+    more = 100
+    keeper = _keeper(found, workers, None, progress, more)
+    return extend(emulator, problem, keeper, seed, settings=settings, more=more, progress=progress)
 
 
 def reaches(model: str, tables: Sequence[Table]) -> bool:

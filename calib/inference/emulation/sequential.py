@@ -21,7 +21,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.batch.environment import one_thread
-from calib.inference.emulation.judge import (
+from calib.inference.design import (
+    across_zero,
+    check_moves,
+    check_scale,
+    choose_nodes,
+    prior_design,
+    prior_middle,
+)
+from calib.inference.emulation import (
     FORESEEN_FROM,
     WORTH,
     foreseen,
@@ -29,12 +37,16 @@ from calib.inference.emulation.judge import (
     idle,
     judged,
 )
-from calib.inference.emulation.nodes import across_zero, choose_nodes
-from calib.inference.emulation.settings import Emulation, EmulationSettings, HeldOut, Progress
-from calib.inference.emulation.state import State, across_too
+from calib.inference.emulation.state import (
+    Emulation,
+    EmulationSettings,
+    HeldOut,
+    Progress,
+    State,
+    across_too,
+)
 from calib.inference.problem import Problem
 from calib.inference.random import generator
-from calib.inference.trial import check_moves, check_scale, prior_design, prior_middle
 from calib.models.base import Array
 from calib.models.simulators.emulator import Emulator
 from calib.models.simulators.kriging import correlation

@@ -11,11 +11,15 @@ import numpy as np
 from calib.batch.environment import one_thread
 from calib.data.registry import Registry
 from calib.errors import CalibError
-from calib.inference.estimators.genetic import GeneticSettings, estimate_genetic, minimise_genetic
-from calib.inference.estimators.least_squares import estimate_least_squares
-from calib.inference.estimators.search import PointEstimate, estimate_differential_evolution
+from calib.inference.design import try_simulator
+from calib.inference.estimators import (
+    GeneticSettings,
+    estimate_genetic,
+    estimate_least_squares,
+    minimise_genetic,
+)
 from calib.inference.problem import Problem
-from calib.inference.trial import try_simulator
+from calib.inference.search import PointEstimate, estimate_differential_evolution
 from calib.models import get_model
 
 __all__ = [

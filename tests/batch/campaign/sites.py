@@ -8,8 +8,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from calib.inference import sampler
 from calib.inference.diagnostics import judge
-from calib.inference.sampling import sampler
 from calib.models import example_csv
 from tests.gap.cases import PULL_ONLY, make_case, write_case
 

@@ -13,10 +13,9 @@ import pytest
 import calib
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration
-from calib.inference.emulation.judge import foreseen
+from calib.inference.emulation import foreseen
 from calib.inference.emulation.prepared import prepare, write_failed
-from calib.inference.emulation.settings import EmulationSettings
-from calib.inference.emulation.state import State
+from calib.inference.emulation.state import EmulationSettings, State
 from calib.models import MODELS
 from calib.models.simulators.base import Failure
 from calib.models.simulators.registered import SIMULATED, Simulated

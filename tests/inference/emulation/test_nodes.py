@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.inference.emulation.nodes import choose_nodes
+from calib.inference.design import choose_nodes
 
 SLIP = np.array([0.05, 0.1, 0.1, 0.4])
 

@@ -6,8 +6,14 @@ import numpy as np
 import pytest
 
 from calib.errors import CalibError
-from calib.inference.estimators import GeneticSettings, estimate, minimise_genetic
-from calib.inference.estimators.genetic import GeneticDraws, descendants, draw_generations
+from calib.inference.estimators import (
+    GeneticDraws,
+    GeneticSettings,
+    descendants,
+    draw_generations,
+    estimate,
+    minimise_genetic,
+)
 
 TABLE_2 = GeneticSettings()
 

@@ -7,8 +7,8 @@ import pytest
 
 from calib.errors import CalibError
 from calib.inference.estimators import estimate
-from calib.inference.estimators.search import hold_unidentified
 from calib.inference.problem import build_problem
+from calib.inference.search import hold_unidentified
 from tests.inference.estimators.conftest import SLIPS, TRUTH
 
 RNG = 11

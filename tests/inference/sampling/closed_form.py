@@ -10,8 +10,8 @@ from scipy import stats
 from scipy.special import gammaln
 
 from calib.inference.diagnostics import ess
-from calib.inference.sampling.proposal import Guess
-from calib.inference.sampling.sampler import Draws, SamplerSettings, sample_density
+from calib.inference.proposal import Guess
+from calib.inference.sampler import Draws, SamplerSettings, sample_density
 from calib.models.base import Array
 
 # Deviations are allowed five standard errors: by chance one in two million.

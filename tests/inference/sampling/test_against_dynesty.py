@@ -13,7 +13,7 @@ from dynesty import NestedSampler
 from scipy import stats
 
 from calib.inference.problem import Problem, build_problem
-from calib.inference.sampling.sampler import sample_posterior
+from calib.inference.sampler import sample_posterior
 from calib.models import MODELS
 from calib.validation.replicate import design_of
 from calib.validation.sbc import holm

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from calib.inference import sampler as sampler_module
 from calib.inference.diagnostics import (
     Gate,
     GateReport,
@@ -15,8 +16,7 @@ from calib.inference.diagnostics import (
     longest_autocorrelation_time,
     psis,
 )
-from calib.inference.sampling import sampler as sampler_module
-from calib.inference.sampling.sampler import SamplerSettings
+from calib.inference.sampler import SamplerSettings
 from tests.inference.sampling.closed_form import linear, run
 
 NAMES = ("a", "b")

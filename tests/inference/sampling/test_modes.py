@@ -10,16 +10,16 @@ from scipy import stats
 
 from calib.data import Table
 from calib.inference.diagnostics import ess
-from calib.inference.priors import Prior, Priors
-from calib.inference.problem import Problem, build_problem
-from calib.inference.sampling.mode import (
+from calib.inference.mode import (
     climb,
     find_mode,
     find_modes,
     hessian_scale,
     prior_widths,
 )
-from calib.inference.sampling.sampler import sample_posterior
+from calib.inference.priors import Prior, Priors
+from calib.inference.problem import Problem, build_problem
+from calib.inference.sampler import sample_posterior
 from tests.custom_problems import fixed, normal, problem_of
 from tests.inference.sampling.closed_form import SIGMAS
 

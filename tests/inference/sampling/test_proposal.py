@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from calib.inference.sampling.proposal import (
+from calib.inference.proposal import (
     Guess,
     Proposal,
     StudentT,

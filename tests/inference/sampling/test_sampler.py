@@ -12,10 +12,10 @@ from scipy import stats
 from calib.data import Table
 from calib.errors import CalibError
 from calib.inference.diagnostics import ess
+from calib.inference.mode import find_modes
 from calib.inference.problem import build_problem
-from calib.inference.sampling.mode import find_modes
-from calib.inference.sampling.proposal import Guess
-from calib.inference.sampling.sampler import (
+from calib.inference.proposal import Guess
+from calib.inference.sampler import (
     Draws,
     SamplerSettings,
     sample_density,

@@ -13,7 +13,7 @@ from calib.cli.app import app
 from calib.errors import CalibError
 from calib.inference.diagnostics import Gate
 from calib.inference.prior_files import default_priors
-from calib.inference.sampling.sampler import SamplerSettings
+from calib.inference.sampler import SamplerSettings
 from calib.report.sbc import text_table, verdict
 from calib.validation.sbc import run_sbc
 from tests.browser import Browser, faults

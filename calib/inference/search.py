@@ -21,8 +21,8 @@ from scipy.linalg import qr
 from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
 from calib.inference.constants import CHUNK_CELLS, FLAT_PART, SHORT_DATA
+from calib.inference.mode import prior_widths
 from calib.inference.problem import Problem
-from calib.inference.sampling.mode import prior_widths
 from calib.models.base import Array, BoundModel, Conditions
 
 

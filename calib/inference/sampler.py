@@ -20,7 +20,8 @@ from scipy.special import logsumexp
 
 from calib.batch.environment import one_thread
 from calib.errors import CalibError
-from calib.inference.constants import ANNEALED, JUDGED, LEAST_STEPS, LONG_DATA
+from calib.inference.constants import ANNEALED, JUDGED, LEAST_LONGER, LEAST_STEPS, LONG_DATA
+from calib.inference.design import try_simulator
 from calib.inference.diagnostics import (
     LEAST_ENSEMBLES,
     Gate,
@@ -28,12 +29,11 @@ from calib.inference.diagnostics import (
     judge,
     longest_autocorrelation_time,
 )
-from calib.inference.estimators.search import representative_rows
+from calib.inference.mode import LogProb, Mode, find_modes
 from calib.inference.priors import SumAndRatio, sum_and_ratio
 from calib.inference.problem import Problem
-from calib.inference.sampling.mode import LogProb, Mode, find_modes
-from calib.inference.sampling.proposal import Guess, Proposal, adapt, moments, refit, systematic
-from calib.inference.trial import try_simulator
+from calib.inference.proposal import Guess, Proposal, adapt, moments, refit, systematic
+from calib.inference.search import representative_rows
 from calib.models.base import Array
 
 type Progress = Callable[[int, int], None]
@@ -299,7 +299,7 @@ def sample_density(
         if neglected.any():
             what = f"{neglected.mean():.1%} of the draws lie where hardly any was proposed"
             report = replace(report, passed=False, reasons=(*report.reasons, what))
-        if report.passed or _LEAST_LONGER * target > settings.max_steps:
+        if report.passed or LEAST_LONGER * target > settings.max_steps:
             break
         target = min(_longer(target, tau, report, settings.gate), settings.max_steps)
         if neglected.any():
@@ -323,17 +323,13 @@ def sample_density(
     )
 
 
-# The next attempt is at least so many times as long.
-_LEAST_LONGER = 1.25
-
-
 def _longer(steps: int, tau: Array, report: GateReport, gate: Gate) -> int:
     """Return the length of the next attempt: what the slowest parameter needs, plus a fifth."""
     ess = np.concatenate([report.ess_bulk, report.ess_tail])
     short = np.concatenate([gate.taus_min * tau / steps, gate.ess_min / ess])
     known = short[np.isfinite(short)]
     needed = 1.2 * float(known.max(initial=0.0))
-    return int(steps * (np.clip(needed, _LEAST_LONGER, 4.0) if needed > 1.2 else 2.0))
+    return int(steps * (np.clip(needed, LEAST_LONGER, 4.0) if needed > 1.2 else 2.0))
 
 
 def _start(log_prob: LogProb, proposal: Proposal, walkers: int, rng: np.random.Generator) -> Array:

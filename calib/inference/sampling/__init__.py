@@ -1,1 +1,0 @@
-"""Sampling with emcee: mode, proposal, moves, gate, sampler."""
