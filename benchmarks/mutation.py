@@ -50,8 +50,7 @@ ALSO = {
     "models/magic_formula": "inference/estimators/test_genetic.py report/test_study.py",
     "models/wong_reece": "models/test_rigid_wheel.py",
     "inference/likelihood": "inference/test_problem.py inference/test_conjugate.py",
-    "inference/diagnostics": "inference/sampling/test_gate.py "
-    "report/test_posterior_text.py validation/test_sensitivity.py",
+    "inference/diagnostics": "report/test_posterior_text.py validation/test_sensitivity.py",
     "gap/effects/": "gap/test_effect_equations.py gap/test_effects.py gap/test_forward.py "
     "gap/test_load_effects.py gap/test_declared.py gap/test_which.py",
     "gap/ascent": "gap/test_fit.py",
