@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.batch.threads import one_thread
+from calib.batch.environment import one_thread
 from calib.data.registry import Registry
 from calib.errors import CalibError
 from calib.inference.design import try_simulator

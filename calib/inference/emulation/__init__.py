@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from calib.batch.threads import one_thread
+from calib.batch.environment import one_thread
 from calib.data.files import plain_number
 from calib.data.quantities import QUANTITIES
 from calib.inference.constants import (
