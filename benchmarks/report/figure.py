@@ -52,7 +52,7 @@ def draw(measured: Mapping[str, Mapping[str, Any]], path: Path) -> None:
             handles |= _likelihood(axes[1, 1], measured["likelihood"])
         if "genetic" in measured:
             handles |= _genetic(axes[1, 2], measured["genetic"]["problems"])
-        legend_below(figure, list(handles.values()), list(handles), ncols=4)
+        legend_below(figure, handles, ncols=4)
         figure.savefig(path, dpi=200)
 
 

@@ -54,7 +54,7 @@ def _legend(fig: Figure) -> None:
     for ax in fig.axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             shown.setdefault(label, handle)
-    legend_below(fig, list(shown.values()), list(shown), 3)
+    legend_below(fig, shown, 3)
 
 
 def costs_plate(audit: Audit) -> Plate:
@@ -404,7 +404,7 @@ def gap_plate(result: FoundGap) -> Plate:
     after.set_title("After: corrected model", loc="left")
     _which(which, result)
     handles, labels = _key(pressure, kept_out=kept_out)
-    legend_below(fig, handles, labels, 3)
+    legend_below(fig, dict(zip(labels, handles, strict=True)), 3)
     return Plate(fig, result.gap.name, _caption(own, kept_out=kept_out), result.gap.title)
 
 

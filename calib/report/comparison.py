@@ -97,8 +97,8 @@ def comparison_figure(comparison: Comparison) -> Figure:
         for row in axes:
             row[0].set_ylabel(y.label)
         legend_below(
-            figure, [dots, dash, bars],
-            ["measured", "median without the row", "90 % interval without the row"], 3,
+            figure, {"measured": dots, "median without the row": dash,
+                     "90 % interval without the row": bars}, 3,
         )  # fmt: skip
     return figure
 

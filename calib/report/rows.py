@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,13 @@ class Result(Protocol):
     @property
     def validation(self) -> Validation | None:
         """How it did on rows that were not fitted, if there were any."""
+
+
+class Fitted(NamedTuple):
+    """A calibration and its validation, if any, where there is no more of a result."""
+
+    calibration: Calibration
+    validation: Validation | None
 
 
 @dataclass(frozen=True)

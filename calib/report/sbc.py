@@ -76,7 +76,7 @@ def ranks_figure(model: ModelScore, adjusted: Mapping[tuple[str, str], float]) -
         figure.supxlabel(
             "probability integral transform (PIT) of the truth", fontsize=8, y=0.45 * _FOOT / height
         )
-        legend_below(figure, list(handles.values()), list(handles), 3)
+        legend_below(figure, handles, 3)
     return figure
 
 
@@ -127,7 +127,7 @@ def coverage_figure(score: SbcScore) -> Figure:
         ax.set_xticks(range(len(levels)), [f"{100 * level:g} % band" for level in levels])
         ax.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:.0f}"))
         ax.set_ylabel("Covered (% of held-out measurements)")
-        legend_below(figure, list(handles.values()), list(handles), 3)
+        legend_below(figure, handles, 3)
     return figure
 
 

@@ -70,7 +70,7 @@ class OutputResult:
     @cached_property
     def evidence(self) -> Evidence:
         """What its verdict is made from."""
-        return gather(self)
+        return gather(self.calibration, self.validation, self.prior_predictive)
 
 
 @dataclass(frozen=True)

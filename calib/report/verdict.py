@@ -13,11 +13,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -28,8 +28,9 @@ from calib.inference.io import RUN
 from calib.inference.problem import Problem
 from calib.inference.random import generator
 from calib.models.base import Array
-from calib.report.labels import axis_of, joined, percent, plain, short, units_of
-from calib.report.rows import Result, held_table, signs_along, x_column
+from calib.report.labels import axis_of, joined, units_of
+from calib.report.page.template import words
+from calib.report.rows import Fitted, held_table, signs_along, x_column
 from calib.report.study_tasks import MAX_ROWS
 from calib.validation.assumptions import checks_of, remarks_of
 from calib.validation.prediction import (
@@ -42,9 +43,6 @@ from calib.validation.prediction import (
 from calib.validation.residuals import LEVEL, Check, Range, Remark, failed
 from calib.validation.scores import MOVED, PRIOR, role, standardise
 from calib.validation.validate import Validation, leave_one_out, validate_held_out
-
-_WEAK_SKILL = 0.5
-_EXPECTED = 0.5
 
 
 class Where(StrEnum):
@@ -194,8 +192,7 @@ class Verdict:
             said.append(f"{self.headline}: do not trust {self.doubt}")
         if self.held_out:
             said.insert(
-                0, f"{self.held_out} were held out of this fit, to judge it by: to predict from "
-                "all that was measured, fit again without --hold-out",
+                0, words("verdict.j2", "calib.report", part="held out", held_out=self.held_out)
             )  # fmt: skip
         return tuple(said)
 
@@ -228,68 +225,26 @@ def _read(ranges: Sequence[Mapping[str, Any]]) -> tuple[Range, ...]:
     )  # fmt: skip
 
 
-def judge_evidence(e: Evidence) -> Verdict:
-    """Apply the rules."""
-    unseen = f"{e.hits} of {e.n} {'held-out rows' if e.held_out else 'left-out rows'}"
-    error = f"{short(e.rmse)} {e.unit} rms"
-    if math.isfinite(e.max_relative_error):
-        error += f", largest error {percent(e.max_relative_error)} of the reading"
-    tests = [
-        *e.checks,
-        Check(e.low_coverage_p, Remark(
-            f"the 90 % band covered only {unseen}, which happens with probability "
-            f"{short(e.low_coverage_p)} if it is right", "Bands too narrow",
-        )),
-        Check(binomial_p(e.sign_changes, e.neighbours, 0.5), Remark(
-            f"residuals change sign {e.sign_changes} {'time' if e.sign_changes == 1 else 'times'} "
-            f"along {e.along}, where about "
-            f"{e.neighbours / 2:.0f} changes would be chance", "Curve misses a pattern", True,
-        )),
-    ]  # fmt: skip
-    surprised = Remark(
-        f"the priors did not expect these data ({e.prior_hits} of {e.prior_n} points lie inside "
-        f"their 95 % band); check {e.suspects}" + "".join(f"; {note}" for note in e.notes),
-        "Data and priors disagree", True,
-    )  # fmt: skip
-    remarks = (
-        *(Remark(f"an emulator stood in for the simulator, and {why}",
-                 "Emulator not good enough", True) for why in e.emulator_fails),
-        *e.remarks, *failed(tests), *[surprised][: e.prior_hits < _EXPECTED * e.prior_n],
-    )  # fmt: skip
-    remarks = tuple(sorted(remarks, key=lambda remark: not remark.title))
-    if not e.converged:
-        return Verdict(
-            Level.NO, "not converged", "NOT CONVERGED", "nothing yet",
-            f"any number of this output: {'; '.join(e.reasons[:2])}. Run it with more steps, or "
-            f"give priors that rule out what makes no sense", remarks,
-        )  # fmt: skip
-    if e.n and not math.isfinite(e.rmse):
-        return Verdict(
-            Level.NO, "not scored", "Not validated", f"the fit inside {e.inside}",
-            "predictions of unseen rows: they could not be scored, since the model has no value "
-            "for part of the posterior there", remarks,
-        )  # fmt: skip
-    fails = [remark for remark in remarks if remark.title]
+def _said(part: str, e: Evidence, **facts: Any) -> str:
+    return words("verdict.j2", "calib.report", part=part, e=e, **facts)
+
+
+# What decides where no assumption fails: the first rule that holds.
+_RULES: tuple[tuple[str, Level, str, Callable[[Evidence], bool]], ...] = (
+    ("not converged", Level.NO, "NOT CONVERGED", lambda e: not e.converged),
+    ("not scored", Level.NO, "Not validated", lambda e: e.n > 0 and not math.isfinite(e.rmse)),
+    ("extrapolated", Level.CARE, "Curvature from the prior",
+     lambda e: e.two_pressures and len(e.prior_set) > 0),
+    ("not validated", Level.CARE, "Not validated", lambda e: e.n == 0),
     # Were none of them covered, it would not be found.
-    few = binomial_p(0, e.n) > LEVEL / len(tests)
-    found = replace(_of_assumptions_that_hold(e, error, even=not fails, few=few), remarks=remarks)
-    if not fails:
-        return found
-    off = any(remark.shifts for remark in fails)
-    trust = "the order of magnitude" if off else "the median"
-    if found.rule == "extrapolated":
-        trust += f" at {e.at_pressures}"
-    elif e.n:
-        trust += f", to {error}"
-    doubted = "the medians and the width of the bands" if off else "the width of the bands"
-    return replace(
-        found, level=Level.CARE, rule=_RULES.get(fails[0].title, "assumption"), where=(),
-        headline=fails[0].title, trust=trust,
-        doubt=f"{doubted}: what they rest on does not hold; {found.doubt}",
-    )  # fmt: skip
+    ("few", Level.CARE, "Too few unseen rows",
+     lambda e: binomial_p(0, e.n) > LEVEL / (len(e.checks) + 2)),
+    ("weak", Level.CARE, "Explains little", lambda e: e.skill < 0.5),
+    ("fine", Level.FINE, "Holds on unseen rows", lambda e: True),
+)  # fmt: skip
 
-
-_RULES = {
+# What decides where one fails, by the title of its remark.
+_FAILS = {
     "Emulator not good enough": "emulated badly",
     "Bands too narrow": "miscovered",
     "Curve misses a pattern": "misfit",
@@ -297,56 +252,38 @@ _RULES = {
 }
 
 
-def _of_assumptions_that_hold(e: Evidence, error: str, *, even: bool, few: bool) -> Verdict:
-    names = joined([plain(name) for name in e.prior_set]) if e.prior_set else ""
-    if e.two_pressures and e.prior_set:
-        return _between_two(e, names, error)
-    if not e.n:
-        return Verdict(
-            Level.CARE, "not validated", "Not validated", f"the fit inside {e.inside}",
-            "predictions: no row was held out or left out to judge them by",
-        )  # fmt: skip
-    if few:
-        return Verdict(
-            Level.CARE, "few", "Too few unseen rows", f"the fit inside {e.inside}",
-            f"predictions: {e.n} {'row' if e.n == 1 else 'rows'} cannot tell whether they hold; "
-            "hold out more, or none, and each row is left out in turn",
-        )  # fmt: skip
-    if e.skill < _WEAK_SKILL:
-        return Verdict(
-            Level.CARE, "weak", "Explains little", f"the bands for {e.inside}",
-            f"the median as a prediction: it removes only {percent(max(0.0, e.skill))} of the "
-            f"scatter (variance) of rows it has not seen",
-        )  # fmt: skip
-    doubt = "anything outside that range" if even else f"anything outside {e.inside}"
-    if e.prior_set:
-        doubt += f"; the values of {names}, which the data did not narrow"
-    trust = f"median and bands for {e.inside}, to {error}"
-    return Verdict(Level.FINE, "fine", "Holds on unseen rows", trust, doubt)
-
-
-def _between_two(e: Evidence, names: str, error: str) -> Verdict:
-    """Say what two pressures leave open, with an error only where it was measured."""
-    verb = "comes" if len(e.prior_set) == 1 else "come"
-    why = f"two pressures do not determine a quadratic, so {names} {verb} from the prior"
-    trust = f"the curves at {e.at_pressures}"
-    if e.unseen_at is Where.BETWEEN:
-        rows = f"{short(e.effective)} independent {'row' if e.effective < 1.05 else 'rows'}"
-        worth = f", {e.n} rows worth {rows}," if math.isfinite(e.effective) else ""
-        doubt = (
-            f"the median between the two pressures, off by {error}: {why}. The width of the band "
-            f"there is the prior's too, and one held-out curve{worth} cannot confirm it"
-        )
-    else:
-        doubt = f"anything between the two pressures: nothing was measured between them, and {why}"
-        if e.unseen_at is Where.BEYOND:
-            doubt += f". Beyond them the median is off by {error}"
-        else:
-            trust += f", to {error}"
-    return Verdict(
-        Level.CARE, "extrapolated", "Curvature from the prior", trust, doubt,
-        where=_elsewhere(e.parabolic_in, e.fitted_at),
+def judge_evidence(e: Evidence) -> Verdict:
+    """Apply the rules."""
+    tests = [
+        *e.checks,
+        Check(e.low_coverage_p, Remark(_said("coverage", e), "Bands too narrow")),
+        Check(binomial_p(e.sign_changes, e.neighbours, 0.5),
+              Remark(_said("pattern", e), "Curve misses a pattern", True)),
+    ]  # fmt: skip
+    emulated = (_said("emulator", replace(e, emulator_fails=[why])) for why in e.emulator_fails)
+    remarks = [
+        *(Remark(text, "Emulator not good enough", True) for text in emulated),
+        *e.remarks,
+        *failed(tests),
+    ]
+    if e.prior_hits < 0.5 * e.prior_n:
+        remarks.append(Remark(_said("surprise", e), "Data and priors disagree", True))
+    remarks.sort(key=lambda remark: not remark.title)
+    rule, level, headline, _ = next(r for r in _RULES if r[3](e))
+    fails = [remark for remark in remarks if remark.title] if level is not Level.NO else []
+    facts = {"rule": rule, "fails": fails, "shifts": any(remark.shifts for remark in fails)}
+    found = Verdict(
+        level, rule, headline, _said("trust", e, **facts), _said("doubt", e, **facts),
+        tuple(remarks),
     )  # fmt: skip
+    if fails:
+        title = fails[0].title
+        return replace(
+            found, level=Level.CARE, headline=title, rule=_FAILS.get(title, "assumption")
+        )
+    if rule == "extrapolated":
+        return replace(found, where=_elsewhere(e.parabolic_in, e.fitted_at))
+    return found
 
 
 def _elsewhere(column: str, values: Sequence[float]) -> tuple[Range, ...]:
@@ -354,21 +291,6 @@ def _elsewhere(column: str, values: Sequence[float]) -> tuple[Range, ...]:
     ends = [-math.inf, *(v for value in values for v in (value, value)), math.inf]
     pairs = zip(ends[::2], ends[1::2], strict=True)
     return tuple(Range(column, low * (1.0 + 1e-9), high * (1.0 - 1e-9)) for low, high in pairs)
-
-
-@dataclass(frozen=True)
-class _Pair:
-    calibration: Calibration
-    validation: Validation | None
-    prior_predictive: Array
-
-
-class Judged(Result, Protocol):
-    """What evidence is gathered of: a result, and what the priors expect of its rows."""
-
-    @property
-    def prior_predictive(self) -> Array:
-        """Measurements that the priors expect at its rows, shape (draws, n)."""
 
 
 def verdict(
@@ -392,9 +314,9 @@ def verdict(
     """
     output = output_of(calibration.problem.bound.model.output)
     prior = prior_predictive(calibration.problem, generator(calibration.seed, output, "prior"))
-    evidence = gather(_Pair(calibration, validation, prior))
+    evidence = gather(calibration, validation, prior)
     found = judge_evidence(replace(evidence, emulator_fails=emulator_fails))
-    held = held_table(_Pair(calibration, validation, prior))
+    held = held_table(Fitted(calibration, validation))
     if held is None:
         return found
     at = f" ({held_out})" if held_out else ""
@@ -427,44 +349,58 @@ def kept_verdict(folder: Path) -> Verdict | None:
     return None if document is None else Verdict.of(document)
 
 
-def gather(result: Judged) -> Evidence:
-    """Collect the evidence of a result, in the units of its file."""
-    with units_of(result.calibration.problem.table.header):
-        return _gathered(result)
+def gather(calibration: Calibration, v: Validation | None, prior_predictive: Array) -> Evidence:
+    """Collect the evidence of a calibration, in the units of its file.
 
-
-def _gathered(result: Judged) -> Evidence:
-    calibration, v = result.calibration, result.validation
-    problem, report = calibration.problem, calibration.draws.report
-    parabolic = problem.bound.model.parabolic_in
-    axis = axis_of(problem.bound.model.output)
+    Parameters
+    ----------
+    calibration : Calibration
+    v : Validation or None
+        How it did on rows that were not fitted, if there were any.
+    prior_predictive : ndarray, shape (draws, n)
+        Measurements that the priors expect at its rows.
+    """
+    result, problem = Fitted(calibration, v), calibration.problem
+    model, parabolic = problem.bound.model, problem.bound.model.parabolic_in
     fitted_at = np.unique(problem.table[parabolic]) if parabolic else np.zeros(0)
     changes, neighbours = signs_along(result, standardise(calibration, problem).residual)
-    return Evidence(
-        converged=report.passed,
-        reasons=report.reasons,
-        **_unseen(result, v),
-        unit=axis.unit,
-        prior_set=[p for p in problem.names if role(calibration, p) in (PRIOR, MOVED)],
-        two_pressures=fitted_at.size == 2,
-        sign_changes=changes,
-        neighbours=neighbours,
-        along=axis_of(x_column(result)).name.lower(),
-        inside=_range_words(result),
-        unseen_at=_unseen_at(problem, v) if parabolic and v and held_table(result) else Where.AT,
-        at_pressures=_at_pressures(result) if parabolic else "",
-        prior_hits=hits(result.prior_predictive, problem.observed, 0.95),
-        prior_n=problem.observed.size,
-        suspects=_suspects(problem),
-        notes=problem.notes,
-        remarks=remarks_of(calibration),
-        checks=checks_of(calibration),
-        parabolic_in=parabolic,
-        fitted_at=tuple(fitted_at.tolist()),
-    )
+    with units_of(problem.table.header):
+        x, axes = axis_of(x_column(result)), {n: axis_of(n) for n in problem.conditions}
+        ranges = {n: f"{a.name.lower()} {a.range_text(problem.table[n])}" for n, a in axes.items()}
+        at_pressures = ""
+        if parabolic:
+            axis = axis_of(parabolic)
+            values = joined([axis.value_text(float(p)) for p in fitted_at])
+            at_pressures = f"{values} {axis.unit} for {ranges[x_column(result)]}"
+        return Evidence(
+            converged=calibration.draws.report.passed,
+            reasons=calibration.draws.report.reasons,
+            **_unseen(result, v),
+            unit=axis_of(model.output).unit,
+            prior_set=[p for p in problem.names if role(calibration, p) in (PRIOR, MOVED)],
+            two_pressures=fitted_at.size == 2,
+            sign_changes=changes,
+            neighbours=neighbours,
+            along=x.name.lower(),
+            inside=joined(list(ranges.values())),
+            unseen_at=_unseen_at(problem, v)
+            if parabolic and v and held_table(result)
+            else Where.AT,
+            at_pressures=at_pressures,
+            prior_hits=hits(prior_predictive, problem.observed, 0.95),
+            prior_n=problem.observed.size,
+            suspects="the units and the normal load"
+            if role_of(model.output) == "pull"
+            else "the units",
+            notes=problem.notes,
+            remarks=remarks_of(calibration),
+            checks=checks_of(calibration),
+            parabolic_in=parabolic,
+            fitted_at=tuple(fitted_at.tolist()),
+        )
 
 
-def _unseen(result: Judged, v: Validation | None) -> dict[str, Any]:
+def _unseen(result: Fitted, v: Validation | None) -> dict[str, Any]:
     """Return what was found on rows that were not fitted."""
     nothing = float("nan")
     if v is None:
@@ -494,31 +430,9 @@ def _unseen(result: Judged, v: Validation | None) -> dict[str, Any]:
     }
 
 
-def _suspects(problem: Problem) -> str:
-    """Name what to check where data and priors disagree."""
-    pull = role_of(problem.bound.model.output) == "pull"
-    return "the units and the normal load" if pull else "the units"
-
-
 def _unseen_at(problem: Problem, validation: Validation) -> Where:
     column = problem.bound.model.parabolic_in
     fitted, unseen = problem.table[column], validation.table[column]
     if bool(((unseen < fitted.min()) | (unseen > fitted.max())).any()):
         return Where.BEYOND
     return Where.AT if bool(np.isin(unseen, fitted).any()) else Where.BETWEEN
-
-
-def _at_pressures(result: Result) -> str:
-    problem = result.calibration.problem
-    column, along = problem.bound.model.parabolic_in, x_column(result)
-    axis, x = axis_of(column), axis_of(along)
-    words = joined([axis.value_text(float(p)) for p in np.unique(problem.table[column])])
-    return f"{words} {axis.unit} for {x.name.lower()} {x.range_text(problem.table[along])}"
-
-
-def _range_words(result: Result) -> str:
-    parts = []
-    for name, values in result.calibration.problem.conditions.items():
-        axis = axis_of(name)
-        parts.append(f"{axis.name.lower()} {axis.range_text(values)}")
-    return joined(parts)

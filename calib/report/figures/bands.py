@@ -28,10 +28,11 @@ from calib.report.figures.style import (
     MIDDLE_MM,
     ORANGE,
     VERMILION,
+    caption,
     legend_below,
     panels,
 )
-from calib.report.labels import Axis, axis_of, joined, percent, short
+from calib.report.labels import Axis, axis_of, short
 from calib.report.reference import NOTHING, Reference
 from calib.report.rows import Group, data_word, grid, group_column, groups, held_table, x_column
 from calib.report.study import OutputResult
@@ -70,32 +71,38 @@ def scatter_points(ax: Axes, x: Array, y: Array, *, held: bool) -> Any:
     return ax.plot(x, y, "o", ms=3.6, color=BLACK, mec="white", mew=0.4, ls="none", zorder=4)[0]
 
 
+def _one_panel_each(
+    shown: list[Group], height: float, bottom: float, top: float
+) -> tuple[Figure, Any, int]:
+    """Return a figure with a panel for each group, the panels, and how many are in a row."""
+    cols = min(3, len(shown))
+    figure, axes = panels(
+        -(-len(shown) // cols), cols, height=height, width=DOUBLE_MM if cols > 1 else MIDDLE_MM,
+        gap_x=3.0, gap_y=8.0, sharex=True, sharey=True, bottom=bottom, top=top,
+    )  # fmt: skip
+    for ax, group in zip(axes.flat, shown, strict=False):
+        ax.set_title(group.title, color=EMBER if group.held else BLACK,
+                     weight="bold" if group.held else "normal")  # fmt: skip
+    for ax in axes.flat[len(shown) :]:
+        ax.set_visible(False)
+    return figure, axes, cols
+
+
 def bands_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Plate:
     """Draw the predictive bands of an output along slip or pressure, beside a published fit."""
-    problem = result.calibration.problem
-    x_axis, y_axis = axis_of(x_column(result)), axis_of(problem.bound.model.output)
     shown = groups(result)
-    cols = min(3, len(shown))
-    rows = -(-len(shown) // cols)
-    width = DOUBLE_MM if cols > 1 else MIDDLE_MM
-    fig, axes = panels(
-        rows, cols, height=52.0 if cols > 1 else 60.0, width=width, bottom=20.0, top=7.0,
-        gap_x=3.0, gap_y=8.0, sharex=True, sharey=True,
+    fig, axes, cols = _one_panel_each(
+        shown, 52.0 if len(shown) > 1 else 60.0, bottom=20.0, top=7.0
     )  # fmt: skip
     handles: dict[str, Any] = {}
     for ax, group in zip(axes.flat, shown, strict=False):
         handles |= _panel(ax, result, group, reference)
-        ax.set_title(group.title, color=EMBER if group.held else BLACK,
-                     weight="bold" if group.held else "normal")  # fmt: skip
-        ax.set_xlabel(x_axis.label)
         ax.margins(x=0.02)
-    for ax in axes.flat[len(shown) :]:
-        ax.set_visible(False)
+    for ax in axes[-1]:
+        ax.set_xlabel(axis_of(x_column(result)).label)
     for ax in axes[:, 0]:
-        ax.set_ylabel(y_axis.label)
-    for ax in axes[:-1].flat:
-        ax.set_xlabel("")
-    legend_below(fig, list(handles.values()), list(handles), 4 if cols > 1 else 3)
+        ax.set_ylabel(axis_of(result.calibration.problem.bound.model.output).label)
+    legend_below(fig, handles, 4 if cols > 1 else 3)
     return Plate(fig, "bands", _bands_caption(result, len(shown)), "Prediction and data")
 
 
@@ -109,13 +116,9 @@ def _panel(ax: Axes, result: OutputResult, group: Group, reference: Reference) -
     curve = reference.curve(problem.bound.model.name, conditions)
     if curve is not None:
         (handles[f"published fit ({curve[1]})"],) = ax.plot(
-            scale(conditions[x]),
-            y_axis.scale(curve[0]),
-            color=ORANGE,
-            lw=1.4,
-            ls=DASHES[3],
+            scale(conditions[x]), y_axis.scale(curve[0]), color=ORANGE, lw=1.4, ls=DASHES[3],
             zorder=3,
-        )
+        )  # fmt: skip
     word = data_word(result)
     for table, rows, draws in (
         (problem.table, group.fitted, result.posterior_predictive),
@@ -148,44 +151,37 @@ def _elsewhere(table: Table, drawn: Mapping[str, Array], x: str) -> NDArray[np.b
     return np.any(apart, axis=0) if apart else np.zeros(len(table), dtype=np.bool_)
 
 
-def observed_words(result: OutputResult) -> str:
-    """Say what the bands covered of the fitted rows and of those not fitted."""
+def _covered(result: OutputResult) -> dict[str, Any]:
+    """Return what the bands covered of the fitted rows and of those not fitted."""
     observed = result.calibration.problem.observed
-    inside = hits(result.posterior_predictive, observed, 0.9)
-    c = result.validation.scores.coverage[0.9]
-    other = "held-out points" if held_table(result) is not None else "points when each is left out"
-    return (
-        f"the 90 % band covers {inside} of {observed.size} calibrated points"
-        f" and {c.hits} of {c.n} {other}"
-    )
+    return {
+        "inside": hits(result.posterior_predictive, observed, 0.9),
+        "fitted": observed.size,
+        "unseen": result.validation.scores.coverage[0.9],
+        "held": held_table(result) is not None,
+        "axis": axis_of(result.calibration.problem.bound.model.output),
+    }
 
 
 def _bands_caption(result: OutputResult, shown: int) -> str:
-    validation = result.validation
-    axis = axis_of(result.calibration.problem.bound.model.output)
-    words = observed_words(result)
-    text = words[0].upper() + words[1:]
-    held = held_table(result)
+    facts, held = _covered(result), held_table(result)
+    worst = pooled = None
     if held is not None:
-        miss = axis.scale(validation.scores.median - validation.observed)
-        i = int(np.nanargmax(np.abs(miss)))
-        where = axis_of(x_column(result))
-        side = "above" if miss[i] > 0 else "below"
-        text += (
-            f"; the median is farthest off at {where.name.lower()}"
-            f" {short(where.factor * held[x_column(result)][i], 3)} {where.unit}, "
-            f"{short(abs(miss[i]))} {axis.unit} {side} the held-out point"
-        )
+        miss = facts["axis"].scale(result.validation.scores.median - result.validation.observed)
+        i, where = int(np.nanargmax(np.abs(miss))), axis_of(x_column(result))
+        at = where.factor * held[x_column(result)][i]
+        worst = {"axis": where, "at": at, "miss": miss[i]}
     column = group_column(result)
     total = 0 if column is None else np.unique(result.task.table[column]).size
     if column is not None and 0 < shown < total:
-        names = joined([g.title for g in groups(result)])
-        text += f". {total} values of {axis_of(column).name.lower()} are shown as {names}"
-    return f"{text}.{_drawn_at(result)}"
+        titles, name = [g.title for g in groups(result)], axis_of(column).name.lower()
+        pooled = {"total": total, "name": name, "titles": titles}
+    drawn_at = _drawn_at(result)
+    return caption("bands", **facts, worst=worst, pooled=pooled, drawn_at=drawn_at)
 
 
-def _drawn_at(result: OutputResult) -> str:
-    """Say at what the curves are drawn, of conditions that vary within a panel; else nothing."""
+def _drawn_at(result: OutputResult) -> list[str]:
+    """Say at what the curves are drawn, of conditions that vary within a panel."""
     table, said = result.calibration.problem.table, []
     for name in result.calibration.problem.bound.model.conditions:
         inside = [table[name][g.fitted] for g in groups(result) if g.fitted.any()]
@@ -198,44 +194,39 @@ def _drawn_at(result: OutputResult) -> str:
             for v in (middles, rows)
         )
         said.append(f"{axis.name.lower()} {at} {axis.unit} (rows at {whole} {axis.unit})")
-    return "" if not said else (
-        f" Curves are drawn at each panel's middle, {joined(said)}; grey bars are the 90 % bands "
-        "of rows at other conditions."
-    )  # fmt: skip
-
-
-# A heavy prior tail would flatten the data: the axis ends at this multiple of their range.
-_ZOOM = 4.0
+    return said
 
 
 def prior_predictive_plate(result: OutputResult) -> Plate:
     """Draw bands of prior predictive measurements at the calibration conditions."""
     problem = result.calibration.problem
-    x_axis, y_axis = axis_of(x_column(result)), axis_of(problem.bound.model.output)
+    y_axis = axis_of(problem.bound.model.output)
     shown = [g for g in groups(result) if g.fitted.any()]
-    cols = min(3, len(shown))
-    rows = -(-len(shown) // cols)
-    fig, axes = panels(
-        rows, cols, height=44.0, width=DOUBLE_MM if cols > 1 else MIDDLE_MM, bottom=16.0, top=6.0,
-        gap_x=3.0, gap_y=8.0, sharex=True, sharey=True,
-    )  # fmt: skip
+    fig, axes, _ = _one_panel_each(shown, 44.0, bottom=16.0, top=6.0)
     handles: dict[str, Any] = {}
     for ax, group in zip(axes.flat, shown, strict=False):
         handles |= _prior_panel(ax, result, group)
-        ax.set_title(group.title)
-    for ax in axes.flat[len(shown) :]:
-        ax.set_visible(False)
     for ax in axes[-1]:
-        ax.set_xlabel(x_axis.label)
+        ax.set_xlabel(axis_of(x_column(result)).label)
     for ax in axes[:, 0]:
         ax.set_ylabel(y_axis.label)
     y = y_axis.scale(problem.observed)
-    reach = _ZOOM * max(float(np.ptp(y)), 0.1 * float(np.abs(y).max()))
+    # A heavy prior tail would flatten the data: the axis ends at four times their range.
+    reach = 4.0 * max(float(np.ptp(y)), 0.1 * float(np.abs(y).max()))
     low, high = axes[0, 0].get_ylim()
     floor = 0.0 if y.min() >= 0.0 and problem.bound.model.response == "log" else y.min() - reach
     axes[0, 0].set_ylim(max(low, floor), min(high, y.max() + reach))
-    legend_below(fig, list(handles.values()), list(handles), 5)
-    return Plate(fig, "prior_predictive", _prior_caption(result), "What the priors alone expect")
+    legend_below(fig, handles, 5)
+    before, after = (
+        np.nanquantile(draws, [0.025, 0.975], axis=0)
+        for draws in (result.prior_predictive, result.posterior_predictive)
+    )
+    said = caption(
+        "prior_predictive", inside=hits(result.prior_predictive, problem.observed, 0.95),
+        fitted=problem.observed.size,
+        ratio=float(np.median(before[1] - before[0]) / np.median(after[1] - after[0])),
+    )  # fmt: skip
+    return Plate(fig, "prior_predictive", said, "What the priors alone expect")
 
 
 def _prior_panel(ax: Axes, result: OutputResult, group: Group) -> dict[str, Any]:
@@ -259,21 +250,8 @@ def _prior_panel(ax: Axes, result: OutputResult, group: Group) -> dict[str, Any]
     return handles
 
 
-def _prior_caption(result: OutputResult) -> str:
-    observed = result.calibration.problem.observed
-    low, high = np.nanquantile(result.prior_predictive, [0.025, 0.975], axis=0)
-    after = np.nanquantile(result.posterior_predictive, [0.025, 0.975], axis=0)
-    inside = hits(result.prior_predictive, observed, 0.95)
-    ratio = float(np.median(high - low) / np.median(after[1] - after[0]))
-    return (
-        f"Before any datum, the priors' 95 % band holds {inside} of {observed.size} calibration "
-        f"points and is {short(ratio)} times as wide as the posterior's."
-    )
-
-
-_WATER_QUANTILES = (0.1, 0.5, 0.9)
 # Yellow would vanish on white.
-_COLOURS = ListedColormap(mpl.colormaps["YlGnBu"](np.linspace(0.35, 1.0, 128)))
+_WATER = ListedColormap(mpl.colormaps["YlGnBu"](np.linspace(0.35, 1.0, 128)))
 
 
 def density_plate(result: OutputResult) -> Plate:
@@ -281,13 +259,21 @@ def density_plate(result: OutputResult) -> Plate:
 
     A CalibError says that the model is not of density by cone index and water content.
     """
-    fig, axes = panels(
-        1, 2, height=64.0, bottom=22.0, left=14.0, gap_x=30.0, right=3.0, top=4.0
-    )  # fmt: skip
-    handles = _against_cone_index(axes[0, 0], fig, result)
+    columns = cone_and_water(result.calibration.problem.bound.model)
+    if columns is None:
+        raise CalibError(
+            "the figure is of density models of cone index and water content",
+            hint="draw `bands_plate` of other models",
+        )
+    fig, axes = panels(1, 2, height=64.0, bottom=22.0, left=14.0, gap_x=30.0, right=3.0, top=4.0)
+    handles = _against_cone_index(axes[0, 0], fig, result, *columns)
     handles |= draw_predicted_observed(axes[0, 1], result)
-    legend_below(fig, list(handles.values()), list(handles), 3)
-    return Plate(fig, "bands", _density_caption(result), "Prediction and data")
+    legend_below(fig, handles, 3)
+    facts = _covered(result)
+    change = [facts["axis"].factor * median_change(result.calibration, name) for name in columns]
+    miss = result.validation.scores.max_relative_error
+    said = caption("density", **facts, effect=change, miss=miss)
+    return Plate(fig, "bands", said, "Prediction and data")
 
 
 def cone_and_water(model: Model) -> tuple[str, str] | None:
@@ -299,27 +285,19 @@ def cone_and_water(model: Model) -> tuple[str, str] | None:
     return roles["cone"], water
 
 
-def _columns(result: OutputResult) -> tuple[str, str]:
-    found = cone_and_water(result.calibration.problem.bound.model)
-    if found is None:
-        raise CalibError(
-            "the figure is of density models of cone index and water content",
-            hint="draw `bands_plate` of other models",
-        )
-    return found
-
-
-def _against_cone_index(ax: Axes, fig: Figure, result: OutputResult) -> dict[str, Any]:
-    problem, (cone, water) = result.calibration.problem, _columns(result)
+def _against_cone_index(
+    ax: Axes, fig: Figure, result: OutputResult, cone: str, water: str
+) -> dict[str, Any]:
+    problem = result.calibration.problem
     ci, w = problem.table[cone], axis_of(water).scale(problem.table[water])
     of_cone, of_density = axis_of(cone), axis_of(problem.bound.model.output)
     handles: dict[str, Any] = {}
     points = ax.scatter(
-        of_cone.scale(ci), of_density.scale(problem.observed), c=w, cmap=_COLOURS, s=17,
+        of_cone.scale(ci), of_density.scale(problem.observed), c=w, cmap=_WATER, s=17,
         edgecolor=BLACK, linewidth=0.4, zorder=4,
     )  # fmt: skip
     x = np.linspace(ci.min(), ci.max(), 60)
-    for quantile, dashes in zip(_WATER_QUANTILES, DASHES, strict=False):
+    for quantile, dashes in zip((0.1, 0.5, 0.9), DASHES, strict=False):
         at = float(np.quantile(problem.table[water], quantile))
         mean, measured = (
             scaled(of_density, b)
@@ -370,27 +348,10 @@ def draw_predicted_observed(ax: Axes, result: OutputResult) -> dict[str, Any]:
                 fmt=shape, ms=3.6, color=colour, ecolor=colour if shape == "s" else GREY,
                 elinewidth=0.7, mec="white", mew=0.4,
             )  # fmt: skip
-    ends = _ends(observed, median)
+    everything = np.append(observed, median)
+    ends = [everything.min(), everything.max()]
     (handles["observed = predicted"],) = ax.plot(ends, ends, color=GREY, lw=0.9, ls=DASHES[2])
     ax.xaxis.set_major_locator(MaxNLocator(5))
     ax.set_xlabel(f"Observed {axis.name.lower()} ({axis.unit})")
     ax.set_ylabel(f"Predicted {axis.name.lower()} ({axis.unit})")
     return handles
-
-
-def _ends(*values: Array) -> Array:
-    everything = np.concatenate(values)
-    return np.array([everything.min(), everything.max()])
-
-
-def _density_caption(result: OutputResult) -> str:
-    cone, water = _columns(result)
-    axis = axis_of(result.calibration.problem.bound.model.output)
-    effect = [axis.factor * median_change(result.calibration, name) for name in (cone, water)]
-    words = observed_words(result)
-    return (
-        f"{words[0].upper()}{words[1:]}. Between the 10 % and 90 % points of the data, cone index "
-        f"moves the density by {short(effect[0])} {axis.unit}, water content by "
-        f"{short(effect[1])} {axis.unit}; the largest miss of a row left out is "
-        f"{percent(result.validation.scores.max_relative_error)}."
-    )

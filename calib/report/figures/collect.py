@@ -12,9 +12,14 @@ from calib.report.figures.bands import (
     density_plate,
     prior_predictive_plate,
 )
-from calib.report.figures.estimates import by_pressure_plate, estimates_plate
 from calib.report.figures.plate import Plate, draw_all, marked
-from calib.report.figures.posterior import corner_plate, ensembles_plate, learned_plate
+from calib.report.figures.posterior import (
+    by_pressure_plate,
+    corner_plate,
+    ensembles_plate,
+    estimates_plate,
+    learned_plate,
+)
 from calib.report.figures.validation import residuals_plate, validation_plate
 from calib.report.labels import units_of
 from calib.report.reference import NOTHING, Reference, reference_of

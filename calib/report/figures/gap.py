@@ -67,7 +67,7 @@ def left_over_plate(found: Diagnosis) -> Plate:
         beyond, total = beyond + int((np.abs(residual) > 2.0).sum()), total + residual.size
     axes[0, 0].set_ylim(-top, top)
     axes[0, 0].set_ylabel("Residual (noise sd)")
-    legend_below(fig, list(handles.values()), list(handles), 3)
+    legend_below(fig, handles, 3)
     share = percent(beyond / max(total, 1)) if beyond else "none"
     caption = (
         f"Residuals of the field rows after {short_name(name)}, the most probable hypothesis: "

@@ -266,7 +266,7 @@ def how_far_plate(found: Diagnosis) -> Plate:
     axes[0, 1].set_title("Error at the field rows", loc="left")
     where = "new conditions" if found.data.case.new_conditions is not None else "field conditions"
     axes[0, 2].set_title(f"Expected at {where}", loc="left")
-    legend_below(fig, list(handles.values()), list(handles), 4)
+    legend_below(fig, handles, 4)
     return Plate(fig, "how_far", _shrink_caption(found, outputs), "How far: before and after")
 
 

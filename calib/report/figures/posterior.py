@@ -1,22 +1,23 @@
-"""Figures of a posterior: pairs of parameters, what data taught, whether ensembles agree."""
+"""Figures of a posterior, what data taught, whether ensembles agree, and of point estimates."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from corner import hist2d
+from corner import corner, overplot_lines
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator, NullLocator
 from scipy.stats import gaussian_kde
 
 from calib.inference.calibration import Calibration
-from calib.inference.diagnostics import N_BINS, rank_histograms, rank_scatter
+from calib.inference.diagnostics import N_BINS, distances, rank_histograms, rank_scatter
+from calib.inference.estimators import PointEstimate, method_name
 from calib.inference.priors import Prior, Priors
 from calib.models.base import Array
+from calib.models.magic_formula import coefficients_at
 from calib.report.figures.plate import Plate
 from calib.report.figures.style import (
     BLACK,
@@ -25,215 +26,85 @@ from calib.report.figures.style import (
     DASHES,
     DOUBLE_MM,
     EMBER,
+    GREY,
+    MARKERS,
     MIDDLE_MM,
     ORANGE,
     SINGLE_MM,
     SMALLEST_PT,
     SYMBOL_PT,
     WIDE,
+    caption,
     legend_below,
     panels,
 )
-from calib.report.labels import MINUS, NO_UNIT, joined, parameter_label, plain, short
+from calib.report.labels import NO_UNIT, joined, parameter_label, plain, short, symbol
 from calib.report.numbers import TIMES
 from calib.report.reference import NOTHING, Reference
 from calib.report.study import OutputResult
+from calib.validation.assumptions import FAR_SDS
 from calib.validation.scores import MOVED, PRIOR, ROLES, role
 
 MAX_PARAMETERS = 11
-_N_DRAWS = 4000
-# Tick labels this near to an end of their panel, as a part of it, would meet the next panel's.
-_CLEAR = 0.1
-# For tick labels and labels to the left and below, and to the right and above.
-_MARGIN_MM, _REST_MM = 19.0, 2.0
-# Part of a cell that its panel takes.
-_FILL = 0.93
-
-
-class _Cells:
-    """Panels as cells of one pair of axes: creating axes is what takes the time of a corner plot.
-
-    Panel (i, j) is column j of row i from the top; a parameter's range maps onto its cell.
-    """
-
-    def __init__(self, draws: Array) -> None:
-        self.d = draws.shape[1]
-        self.low, self.high = np.quantile(draws, [0.001, 0.999], axis=0)
-
-    def part(self, j: int, value: Array | float) -> Array:
-        """Map a parameter's values onto 0 to `_FILL`."""
-        return np.asarray(_FILL * (value - self.low[j]) / (self.high[j] - self.low[j]))
-
-    def x(self, j: int, value: Array | float) -> Array:
-        """Abscissa of values of parameter j."""
-        return np.asarray(j + self.part(j, value))
-
-    def bottom(self, i: int) -> float:
-        """Ordinate of the foot of row i."""
-        return float(self.d - 1 - i)
-
-    def ticks(self, j: int, most: int) -> Array:
-        """A few round values inside the range."""
-        clear = _CLEAR * (self.high[j] - self.low[j])
-        low, high = self.low[j] + clear, self.high[j] - clear
-        for n in range(most, most + 3):
-            values = np.asarray(MaxNLocator(n).tick_values(low, high))
-            found = values[(values >= low) & (values <= high)]
-            if found.size >= 2:
-                break
-        return np.asarray(found[:: -(-found.size // most)])
 
 
 def corner_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Plate:
     """Draw every pair of sampled parameters, and mark published ones."""
     draws, priors, wide = _sampled(result.calibration)
-    marks = reference.sampled(result.calibration.problem.bound)
-    at = [
-        np.log10(marks[p.name]) if w and p.name in marks else marks.get(p.name)
+    printed = reference.sampled(result.calibration.problem.bound)
+    ends, d = np.quantile(draws, [0.001, 0.999], axis=0).T, len(priors)
+    size = SINGLE_MM if d <= 2 else MIDDLE_MM if d <= 5 else DOUBLE_MM
+    figure = Figure(figsize=(size / 25.4, size / 25.4))
+    corner(
+        draws, fig=figure, range=ends, bins=24, levels=(0.5, 0.9), smooth=1.0, color=BLUE,
+        plot_datapoints=False, plot_density=False, fill_contours=True, no_fill_contours=True,
+        contour_kwargs={"linewidths": 0.6}, max_n_ticks=2 if d > 7 else 3,
+        labels=[
+            parameter_label(p.name, p.unit, log=w).replace(" (", "\n(", 1)
+            for p, w in zip(priors, wide, strict=True)
+        ],
+    )  # fmt: skip
+    marks = [
+        printed.get(p.name, np.nan) if not w else np.log10(printed.get(p.name, np.nan))
         for p, w in zip(priors, wide, strict=True)
     ]
-    labels = [
-        parameter_label(p.name, p.unit, log=w).replace(" (", "\n(", 1)
-        for p, w in zip(priors, wide, strict=True)
-    ]
-    cells = _Cells(draws)
-    fig, ax = _frame(cells)
-    for i in range(cells.d):
-        _marginal(ax, cells, i, draws[:, i])
-        for j in range(i):
-            _pair(ax, cells, i, j, draws)
-    _marks(ax, cells, at)
-    _ticks(ax, cells, labels)
-    note = "contours hold 50 % and 90 %" + ("\ndashed: published" if marks else "")
-    ax.text(1.1, cells.d - 0.1, note, va="top", fontsize=SMALLEST_PT)
-    ax.set_xlim(0.0, cells.d)
-    ax.set_ylim(0.0, cells.d)
-    caption = _caption(draws, [p.name for p in priors], bool(marks))
-    return Plate(fig, "corner", caption, "Posterior, in pairs")
+    marks = [m if low <= m <= high else None for m, (low, high) in zip(marks, ends, strict=True)]
+    overplot_lines(figure, marks, color=ORANGE, lw=0.9, ls=DASHES[1])
+    # Room for labels to the left and below, and their distance from the panels, in millimetres.
+    room, away = 19.0 / size, 14.0 * 1.07 * d / (size - 21.0)
+    figure.subplots_adjust(
+        left=room, bottom=room, right=1 - 2 / size, top=1 - 2 / size, wspace=0.07, hspace=0.07
+    )
+    for ax in figure.axes:
+        ax.tick_params(axis="x", labelrotation=90)
+        ax.tick_params(axis="y", labelrotation=0)
+        ax.xaxis.set_label_coords(0.5, -away)
+        ax.yaxis.set_label_coords(-away, 0.5)
+        for axis in (ax.xaxis, ax.yaxis):
+            axis.label.set_fontsize(SYMBOL_PT)
+            axis.label.set_verticalalignment("center")
+    note = "contours hold 50 % and 90 %" + ("\ndashed: published" if printed else "")
+    figure.text(0.98, 0.97, note, va="top", ha="right", fontsize=SMALLEST_PT)
+    # Of a pair once, or rounding decides which of the two is named first.
+    correlation = np.tril(np.corrcoef(draws, rowvar=False), -1)
+    i, j = np.unravel_index(np.abs(correlation).argmax(), correlation.shape)
+    said = caption(
+        "corner", pair=(priors[j].name, priors[i].name), correlation=float(correlation[i, j]),
+        strong=int((np.abs(correlation) > 0.8).sum()), pairs=d * (d - 1) // 2,
+        marked=bool(printed),
+    )  # fmt: skip
+    return Plate(figure, "corner", said, "Posterior, in pairs")
 
 
 def _sampled(calibration: Calibration) -> tuple[Array, list[Prior], list[bool]]:
     """Thinned draws of the first free parameters, by their decimal logarithm where wide."""
     entries = calibration.problem.priors.entries
     free = [i for i, p in enumerate(entries) if not p.fixed][:MAX_PARAMETERS]
-    natural = calibration.problem.theta(calibration.subset(_N_DRAWS))[:, free]
+    natural = calibration.problem.theta(calibration.subset(4000))[:, free]
     low, high = np.quantile(natural, [0.02, 0.98], axis=0)
     wide = [bool(entries[i].log and high[j] > WIDE * low[j]) for j, i in enumerate(free)]
     natural[:, wide] = np.log10(natural[:, wide])
     return natural, [entries[i] for i in free], wide
-
-
-def _width(d: int) -> float:
-    """Width in millimetres of a figure of so many parameters."""
-    return SINGLE_MM if d <= 2 else MIDDLE_MM if d <= 5 else DOUBLE_MM
-
-
-def _frame(cells: _Cells) -> tuple[Figure, Axes]:
-    """One pair of axes without spines; every panel gets a left and a lower edge."""
-    total = _width(cells.d)
-    margin, edge = _MARGIN_MM, total - _MARGIN_MM - _REST_MM
-    fig = Figure(figsize=(total / 25.4, total / 25.4))
-    ax = fig.add_axes((margin / total, margin / total, edge / total, edge / total))
-    ax.set_axis_off()
-    edges = []
-    for i in range(cells.d):
-        for j in range(i + 1):
-            y = cells.bottom(i)
-            edges.append([(j, y), (j + _FILL, y)])
-            if i != j:
-                edges.append([(j, y), (j, y + _FILL)])
-    ax.add_collection(LineCollection(edges, colors=BLACK, linewidths=0.6, clip_on=False))
-    return fig, ax
-
-
-def _marginal(ax: Axes, cells: _Cells, i: int, draws: Array) -> None:
-    counts, edges = np.histogram(draws, 30, (cells.low[i], cells.high[i]))
-    height = cells.bottom(i) + 0.85 * counts / counts.max()
-    ax.stairs(height, cells.x(i, edges), baseline=cells.bottom(i), color=BLUE, lw=1.0)
-
-
-def _pair(ax: Axes, cells: _Cells, i: int, j: int, draws: Array) -> None:
-    y = cells.bottom(i)
-    before = len(ax.collections)
-    hist2d(
-        cells.x(j, draws[:, j]), y + cells.part(i, draws[:, i]), bins=24, ax=ax,
-        levels=(0.5, 0.9), smooth=1.0, range=[(j, j + _FILL), (y, y + _FILL)],
-        plot_datapoints=False, plot_density=False, fill_contours=True, no_fill_contours=True,
-        color=BLUE,
-        contour_kwargs={"linewidths": 0.6},
-    )  # fmt: skip
-    # Smoothed contours reach a little beyond the range.
-    for contour in ax.collections[before:]:
-        contour.set_clip_path(Rectangle((j, y), _FILL, _FILL, transform=ax.transData))
-
-
-def _marks(ax: Axes, cells: _Cells, at: list[float | None]) -> None:
-    """Published values as dashed lines across their row and column, where they lie inside."""
-    lines = []
-    for k, value in enumerate(at):
-        if value is not None and cells.low[k] <= value <= cells.high[k]:
-            part = float(cells.part(k, value))
-            y = cells.bottom(k)
-            lines += [
-                [(k + part, cells.bottom(i)), (k + part, cells.bottom(i) + _FILL)]
-                for i in range(k, cells.d)
-            ]
-            lines += [[(j, y + part), (j + _FILL, y + part)] for j in range(k)]
-    ax.add_collection(LineCollection(lines, colors=ORANGE, linewidths=0.9, linestyles=[DASHES[1]]))
-
-
-def _ticks(ax: Axes, cells: _Cells, labels: list[str]) -> None:
-    many = cells.d > 7
-    most, tick = (2, 0.05) if many else (3, 0.03)
-    style: dict[str, Any] = {"fontsize": SMALLEST_PT, "clip_on": False}
-    # Distances from the panels are in cells, so they grow with the number of panels.
-    away = 14.0 * cells.d / (_width(cells.d) - _MARGIN_MM - _REST_MM)
-    lines = []
-    for k, label in enumerate(labels):
-        y = cells.bottom(k)
-        ticks = cells.ticks(k, most)
-        for value, text in zip(ticks, _tick_texts(ticks), strict=True):
-            part = float(cells.part(k, value))
-            lines.append([(k + part, 0.0), (k + part, -tick)])
-            ax.text(k + part, -1.6 * tick, text, ha="center", va="top",
-                    rotation=90, **style)  # fmt: skip
-            if k > 0:
-                lines.append([(0.0, y + part), (-tick, y + part)])
-                ax.text(-1.6 * tick, y + part, text, ha="right", va="center", **style)
-        ax.text(k + 0.5 * _FILL, -away, label, ha="center", va="center", fontsize=SYMBOL_PT)
-        if k > 0:
-            ax.text(-away, y + 0.5 * _FILL, label, rotation=90, ha="center", va="center",
-                    fontsize=SYMBOL_PT)  # fmt: skip
-    ax.add_collection(LineCollection(lines, colors=BLACK, linewidths=0.6, clip_on=False))
-
-
-def _tick_texts(values: Array) -> list[str]:
-    """Write the values of ticks, with the decimals that the finest of them needs."""
-    texts = [f"{value:.6g}" for value in values]
-    decimals = max((len(text.partition(".")[2]) for text in texts if "e" not in text), default=0)
-    return [
-        (text if "e" in text else f"{value:.{decimals}f}").replace("-", MINUS)
-        for text, value in zip(texts, values, strict=True)
-    ]
-
-
-def _caption(draws: Array, names: list[str], marked: bool) -> str:
-    # Of a pair once, or rounding decides which of the two is named first.
-    correlation = np.tril(np.corrcoef(draws, rowvar=False), -1)
-    i, j = np.unravel_index(np.abs(correlation).argmax(), correlation.shape)
-    strong = int((np.abs(correlation) > 0.8).sum())
-    pairs = len(names) * (len(names) - 1) // 2
-    marks = " Dashed: what the published figures amount to." if marked else ""
-    verb = "exceeds" if strong in (0, 1) else "exceed"
-    few = f"{strong} of {pairs} pairs" if strong else f"none of the {pairs} pairs"
-    return (
-        f"{plain(names[j])} and {plain(names[i])} are tied most closely (correlation "
-        f"{short(float(correlation[i, j]))}); {few} {verb} 0.8.{marks}"
-    )
-
-
-_KDE_DRAWS = 3000
-_MOST_TICKS = 4
 
 
 def learned_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Plate:
@@ -246,7 +117,7 @@ def learned_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Pl
     fig, axes = panels(
         rows, cols, height=28.0, left=6.0, right=4.0, top=8.0, bottom=18.0, gap_x=6.0, gap_y=17.0
     )
-    t = calibration.subset(_KDE_DRAWS)
+    t = calibration.subset(3000)
     handles: dict[str, Any] = {}
     for j, (ax, prior) in enumerate(zip(axes.flat, free, strict=False)):
         handles |= _prior_posterior(ax, prior, t[:, j], marks.get(prior.name))
@@ -258,8 +129,16 @@ def learned_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Pl
         )  # fmt: skip
     for ax in axes.flat[len(free) :]:
         ax.set_visible(False)
-    legend_below(fig, list(handles.values()), list(handles), 3)
-    return Plate(fig, "learned", _learned_caption(calibration), "What the data taught")
+    legend_below(fig, handles, 3)
+    roles = {what: [plain(p.name) for p in free if role(calibration, p.name) == what]
+             for what in ROLES}  # fmt: skip
+    ratios = {p.name: calibration.summary[p.name].sd_ratio for p in free}
+    sharpest = min(ratios, key=lambda name: ratios[name])
+    said = caption(
+        "learned", roles={what: names for what, names in roles.items() if names},
+        sharpest=sharpest, ratio=ratios[sharpest],
+    )  # fmt: skip
+    return Plate(fig, "learned", said, "What the data taught")
 
 
 def _prior_posterior(ax: Axes, prior: Prior, t: Array, mark: float | None) -> dict[str, Any]:
@@ -299,9 +178,9 @@ def _log_ticks(low: float, high: float) -> list[float]:
     powers = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
     for steps in ((1, 2, 5), (1, 3), (1,)):
         found = [s * 10.0**k for k in powers for s in steps if low <= s * 10.0**k <= high]
-        if len(found) <= _MOST_TICKS:
+        if len(found) <= 4:
             return found
-    return found[:: -(-len(found) // _MOST_TICKS)]
+    return found[:: -(-len(found) // 4)]
 
 
 def _range(prior: Prior, t: Array) -> tuple[float, float]:
@@ -311,73 +190,44 @@ def _range(prior: Prior, t: Array) -> tuple[float, float]:
     return max(low, prior.lower - pad), min(high, prior.upper + pad)
 
 
-def _learned_caption(calibration: Calibration) -> str:
-    found: dict[str, list[str]] = {}
-    for prior in calibration.problem.priors.free:
-        found.setdefault(role(calibration, prior.name), []).append(plain(prior.name))
-    parts = []
-    for what in (r for r in ROLES if r in found):
-        verb = "is" if len(found[what]) == 1 else "are"
-        said = "set " + what if what.startswith("partly") else what
-        parts.append(f"{joined(found[what])} {verb} {said}")
-    ratios = {p.name: calibration.summary[p.name].sd_ratio for p in calibration.problem.priors.free}
-    sharpest = min(ratios, key=lambda name: ratios[name])
-    return (
-        f"{'; '.join(parts)}. The data taught most about {plain(sharpest)}, whose sd shrank to "
-        f"{short(ratios[sharpest])} of the prior's (the sd ratio)."
-    )
-
-
 def ensembles_plate(result: OutputResult) -> Plate:
-    """Draw traces of the ensemble means and rank histograms."""
+    """Draw traces of the ensemble means and rank histograms, side by side."""
     calibration = result.calibration
     draws, free = calibration.draws, calibration.problem.priors.free
     per_row = 2 if len(free) <= 6 else 3
-    rows = -(-len(free) // per_row)
-    fig, pairs = _pairs(rows, per_row, len(free))
+    fig, axes = panels(
+        -(-len(free) // per_row), 2 * per_row, height=24.0 if per_row == 2 else 21.0, left=18.0,
+        bottom=21.0, top=5.5, gap_x=17.0 if per_row == 2 else 15.0, gap_y=5.5,
+        ratios=(2.0, 1.0) * per_row,
+    )  # fmt: skip
+    pairs = axes.reshape(-1, 2)
     ess = dict(zip(draws.report.names, draws.report.ess_bulk, strict=True))
     handles: dict[str, Any] = {}
-    for j, prior in enumerate(free):
+    for j, (prior, (trace, ranks)) in enumerate(zip(free, pairs, strict=False)):
         t = draws.t[..., j]
         natural = np.exp(t) if prior.log else t
         low, high = np.quantile(natural, [0.02, 0.98])
         # Of a parameter that spans decades, the mean would show its largest draws alone.
         wide = bool(prior.log and high > WIDE * low)
-        trace, ranks = pairs[j]
         handles |= _trace(trace, np.log10(natural) if wide else natural)
         trace.set_ylabel(parameter_label(prior.name, prior.unit, log=wide))
         _ranks(ranks, natural.reshape(natural.shape[0], -1), ess[prior.name] / natural.shape[0])
-        if j >= len(free) - per_row:
-            trace.set_xlabel(f"Step ({NO_UNIT})")
-            ranks.set_xlabel(f"Rank ({NO_UNIT})")
-        else:
-            trace.tick_params(labelbottom=False)
-            ranks.tick_params(labelbottom=False)
+        last = j >= len(free) - per_row
+        for ax, what in ((trace, "Step"), (ranks, "Rank")):
+            ax.set_xlabel(f"{what} ({NO_UNIT})" if last else "")
+            ax.tick_params(labelbottom=last)
+    for ax in pairs[len(free) :].flat:
+        ax.set_visible(False)
     handles["rank count over expected count, 95 % range"] = pairs[0][1].collections[0]
-    legend_below(fig, list(handles.values()), list(handles), len(handles))
-    return Plate(fig, "ensembles", _ensembles_caption(result), "Convergence of the ensembles")
-
-
-def _pairs(rows: int, per_row: int, n: int) -> tuple[Figure, list[tuple[Axes, Axes]]]:
-    """Axes in pairs, trace wider than ranks, laid out in millimetres."""
-    height, gap_y, top, bottom = (21.0 if per_row == 3 else 24.0), 5.5, 5.5, 17.0
-    cell = DOUBLE_MM / per_row
-    total = top + bottom + rows * height + (rows - 1) * gap_y
-    fig = Figure(figsize=(DOUBLE_MM / 25.4, total / 25.4))
-    # Two in a row leave room for longer tick labels.
-    left, between, right = (17.0, 10.0, 2.5) if per_row == 3 else (20.0, 11.0, 3.0)
-    span = cell - left - between - right
-    found = []
-    for k in range(n):
-        row, col = divmod(k, per_row)
-        y = (total - top - height - row * (height + gap_y)) / total
-        x = col * cell + left
-        trace = fig.add_axes((x / DOUBLE_MM, y, 0.6 * span / DOUBLE_MM, height / total))
-        ranks = fig.add_axes(
-            ((x + 0.6 * span + between) / DOUBLE_MM, y, 0.4 * span / DOUBLE_MM, height / total)
-        )
-        found.append((trace, ranks))
-    return fig, found
+    legend_below(fig, handles, 3)
+    r = draws.report
+    worst, poorest = int(np.nanargmax(r.rhat)), int(np.nanargmin(r.ess_bulk))
+    said = caption(
+        "ensembles", r=r, ensembles=draws.t.shape[0], walkers=draws.walkers, rhat=r.rhat[worst],
+        worst=r.names[worst], ess=r.ess_bulk[poorest], poorest=r.names[poorest],
+        taus=float((r.steps / r.tau).min()),
+    )  # fmt: skip
+    return Plate(fig, "ensembles", said, "Convergence of the ensembles")
 
 
 def _trace(ax: Axes, natural: Array) -> dict[str, Any]:
@@ -412,14 +262,174 @@ def _ranks(ax: Axes, values: Array, effective: float) -> None:
     ax.set_ylabel(f"Ratio ({NO_UNIT})", fontsize=SMALLEST_PT, labelpad=1.0)
 
 
-def _ensembles_caption(result: OutputResult) -> str:
-    r, draws = result.calibration.draws.report, result.calibration.draws
-    worst, poorest = int(np.nanargmax(r.rhat)), int(np.nanargmin(r.ess_bulk))
-    verdict = "agree" if r.passed else "do NOT pass the convergence gate"
-    return (
-        f"{draws.t.shape[0]} independently seeded ensembles {verdict}: the largest R-hat is "
-        f"{r.rhat[worst]:.3f} ({plain(r.names[worst])}), the smallest bulk ESS "
-        f"{r.ess_bulk[poorest]:.0f} ({plain(r.names[poorest])}), over {r.steps} steps of "
-        f"{draws.walkers} walkers, {short(float((r.steps / r.tau).min()))} autocorrelation "
-        f"times or more."
+# Point estimates
+
+_METHODS = (
+    "geometric", "genetic", "differential_evolution", "least_squares", "published_regression",
+)  # fmt: skip
+_LOOKS = {name: (MARKERS[i], CYCLE[i]) for i, name in enumerate(_METHODS)}
+# Estimates farther off than this many posterior sds are drawn at the edge.
+_EDGE = 5.0
+
+
+def estimates_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Plate:
+    """Draw every method's estimate of every published parameter, in posterior sds."""
+    calibration = result.calibration
+    reported = [k for k, v in calibration.reported.items() if np.ptp(v) > 0.0]
+    model = calibration.problem.bound.model
+    printed = reference.parameters(model.name)
+    fig, axes = panels(
+        1, 1, height=max(34.0, 8.0 * len(reported)), width=MIDDLE_MM, left=18.0, bottom=22.0,
+        top=3.0,
+    )  # fmt: skip
+    ax: Axes = axes[0, 0]
+    handles: dict[str, Any] = {}
+    names, reach = [], 2.5
+    for i, name in enumerate(reported):
+        values = [e.reported[name] for e in result.estimates]
+        values.append(printed[name].value if name in printed else np.nan)
+        distance, interval, log = _distances(result, name, values)
+        reach = max(reach, *np.abs(interval), np.nanmax(np.abs(distance), initial=0.0))
+        (handles["posterior, 95 % HDI"],) = ax.plot(
+            interval, [i, i], color="#c4c4c4", lw=4.0, solid_capstyle="butt"
+        )
+        (handles["posterior mean"],) = ax.plot(0.0, i, "|", color=BLACK, ms=9.0, mew=1.3, zorder=3)
+        handles |= _estimates_row(ax, i, distance, result.estimates, reference.source(model.name))
+        names.append(f"ln {symbol(name)}" if log else symbol(name))
+    reach = 1.08 * min(_EDGE, reach)
+    ax.set_xlim(-reach, reach)
+    ax.set_yticks(range(len(names)), names, fontsize=SYMBOL_PT)
+    ax.set_ylim(len(names) - 0.4, -0.6)
+    ax.axvline(0.0, color=GREY, lw=0.5, zorder=0)
+    ax.set_xlabel("Distance from the posterior mean (posterior sds)")
+    ax.set_ylabel(f"Parameter ({NO_UNIT})")
+    legend_below(fig, handles, 3)
+    said = caption("estimates", **_estimates_facts(result, reported, reference))
+    return Plate(fig, "estimates", said, "Point estimates")
+
+
+def _distances(
+    result: OutputResult, name: str, values: Sequence[float]
+) -> tuple[Array, Array, bool]:
+    s = result.calibration.summary[name]
+    draws = result.calibration.reported[name].ravel()
+    return distances(draws, np.array(values), (s.hdi_lower, s.hdi_upper))
+
+
+def _estimates_row(
+    ax: Axes, i: int, distance: Array, estimates: tuple[PointEstimate, ...], source: str
+) -> dict[str, Any]:
+    handles: dict[str, Any] = {}
+    spread = np.linspace(-0.33, 0.33, max(2, len(estimates)))
+    for k, (estimate, d) in enumerate(zip(estimates, distance[:-1], strict=True)):
+        if np.isfinite(d):
+            name = method_name(estimate.method)
+            marker, colour = _LOOKS.get(estimate.method, ("P", GREY))
+            handles[name] = _dot(ax, float(d), i + float(spread[k]), marker, colour)
+    if np.isfinite(distance[-1]):
+        handles[f"published ({source})"] = _dot(ax, float(distance[-1]), i, "D", ORANGE, ring=True)
+    return handles
+
+
+def _dot(ax: Axes, d: float, y: float, marker: str, colour: str, *, ring: bool = False) -> Any:
+    """A dot; at the edge, with its distance written, where it is far off."""
+    x = float(np.clip(d, -_EDGE, _EDGE))
+    face = "none" if ring else colour
+    edge, width, size = (colour, 1.3, 7.0) if ring else ("white", 0.4, 4.6)
+    (dot,) = ax.plot(x, y, marker, mfc=face, mec=edge, mew=width, ms=size, zorder=4 + ring)
+    if abs(d) > _EDGE:
+        ax.annotate(
+            f"{short(d)} ►" if d > 0 else f"◄ {short(d)}", (x, y),
+            (-6.0 if d > 0 else 6.0, 0.0), textcoords="offset points", fontsize=SMALLEST_PT,
+            va="center", ha="right" if d > 0 else "left",
+        )  # fmt: skip
+    return dot
+
+
+def _estimates_facts(
+    result: OutputResult, names: Sequence[str], reference: Reference
+) -> dict[str, Any]:
+    lowest = min((e.cost for e in result.estimates), default=0.0)
+    # Of costs that are equal but for their rounding, that of the most exact method: it comes last.
+    best = next((e for e in reversed(result.estimates) if e.cost <= lowest * (1.0 + 1e-9)), None)
+    if best is None:
+        return {"best": None}
+    off = {n: abs(float(_distances(result, n, [best.reported[n]])[0][0])) for n in names}
+    far = max(names, key=lambda n: off[n])
+    model, s = result.calibration.problem.bound.model.name, result.calibration.summary
+    printed = {n: f.value for n, f in reference.parameters(model).items() if n in names}
+    outside = [n for n, v in printed.items() if not s[n].hdi_lower <= v <= s[n].hdi_upper]
+    return {
+        "best": best, "method": method_name(best.method), "far": far, "distance": off[far],
+        "limit": FAR_SDS, "outside": [plain(n) for n in names if n in outside],
+        "source": reference.source(model) if reference.parameters(model) else "",
+    }  # fmt: skip
+
+
+def by_pressure_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Plate | None:
+    """Draw B, C, D and E of each pressure by method; None where pressures were not fitted alone."""
+    pressures = list(result.by_pressure)
+    if not pressures:
+        return None
+    calibration = result.calibration
+    joint = coefficients_at(
+        calibration.problem.of_model(calibration.problem.theta(calibration.subset(1000))),
+        np.array(pressures),
+        calibration.problem.bound.references,
+    )  # fmt: skip
+    fig, axes = panels(1, 4, height=46.0, left=14.0, bottom=24.0, gap_x=15.0, top=4.0)
+    handles: dict[str, Any] = {}
+    units = {"B": "1/%", "C": "1", "D": "kN", "E": "1"}
+    for ax, name in zip(axes[0], "BCDE", strict=True):
+        handles |= _coefficient(ax, result, name, joint[name], reference)
+        ax.set_xticks(range(len(pressures)), [f"{p:g}" for p in pressures])
+        ax.tick_params(axis="x", labelsize=SMALLEST_PT)
+        ax.set_xlim(-0.65, len(pressures) - 0.35)
+        ax.set_xlabel("Pressure (psi)")
+        ax.set_ylabel(parameter_label(name, units[name]))
+    legend_below(fig, handles, 3)
+    costs = [(psi, min(e.cost for e in estimates), reference.beside("genetic", psi))
+             for psi, estimates in result.by_pressure.items()]  # fmt: skip
+    said = caption("by_pressure", costs=costs)
+    return Plate(fig, "by_pressure", said, "Each pressure on its own")
+
+
+def _coefficient(
+    ax: Axes, result: OutputResult, name: str, joint: Array, reference: Reference
+) -> dict[str, Any]:
+    handles: dict[str, Any] = {}
+    low, middle, high = np.nanquantile(joint, [0.05, 0.5, 0.95], axis=0)
+    fitted = np.unique(result.calibration.problem.table["inflation_pressure_psi"])
+    jointly = f"{joined([f'{p:g}' for p in fitted])} psi"
+    if set(result.by_pressure) <= set(fitted.tolist()):
+        jointly = "all pressures"
+    elif fitted.size > 5:  # no room in the legend to list them
+        jointly = f"{fitted.size} pressures"
+    for i, (psi, estimates) in enumerate(result.by_pressure.items()):
+        handles[f"{jointly} calibrated jointly, 90 %"] = ax.errorbar(
+            i - 0.4, middle[i], yerr=[[middle[i] - low[i]], [high[i] - middle[i]]], fmt="_",
+            color=BLACK, ms=6.0, elinewidth=1.0,
+        )  # fmt: skip
+        for k, e in enumerate(estimates):
+            marker, colour = _LOOKS.get(e.method, ("P", GREY))
+            (handles[method_name(e.method)],) = ax.plot(
+                i - 0.2 + 0.2 * k, e.reported[name], marker, color=colour, ms=4.6,
+                mec="white", mew=0.4,
+            )  # fmt: skip
+        printed = zip(reference.alone.values(), (-0.2, 0.0), "os", strict=False)
+        for table, at, shape in printed:
+            if psi in table:
+                label = f"published ({table[round(psi)].place})"
+                (handles[label],) = ax.plot(
+                    i + at, table[round(psi)].values[name], shape, mfc="none", mec=ORANGE,
+                    mew=1.2, ms=8.0,
+                )  # fmt: skip
+    spread = [e.reported[name] for group in result.by_pressure.values() for e in group]
+    pad = 0.25 * max(float(np.ptp(spread)), 1e-9)
+    everything = np.concatenate([low, high, spread])
+    bottom, top = (
+        max(everything.min(), min(spread) - 4 * pad),
+        min(everything.max(), max(spread) + 4 * pad),
     )
+    ax.set_ylim(bottom - 0.4 * pad, top + 0.4 * pad)
+    return handles

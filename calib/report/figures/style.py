@@ -8,20 +8,18 @@ so the style holds then as well.
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Literal
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg, RendererAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import ScalarFormatter
 from numpy.typing import NDArray
+from PIL import Image
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from calib.report.page.template import words
 
 if TYPE_CHECKING:
     from calib.report.figures.plate import Plate
@@ -58,8 +56,6 @@ _RC: dict[Any, Any] = {
     "axes.spines.right": False,
     "axes.linewidth": 0.6,
     "axes.titlepad": 4.0,
-    # Where it is put by default: to look for labels in its way takes longer than to draw it.
-    "axes.titley": 1.0,
     "axes.labelpad": 2.5,
     "xtick.major.width": 0.6,
     "ytick.major.width": 0.6,
@@ -70,13 +66,13 @@ _RC: dict[Any, Any] = {
     "figure.facecolor": "white",
     "savefig.facecolor": "white",
     "mathtext.fontset": "dejavusans",
-    # At this resolution glyphs need no fitting to pixels, which takes a third of drawing text.
     "text.hinting": "none",
     "axes.unicode_minus": True,
     # Type 3 fonts, the default, are refused by publishers.
     "pdf.fonttype": 42,
     # Long tick labels would push the axis label off the figure: a common power of ten instead.
     "axes.formatter.limits": (-3, 4),
+    "axes.formatter.use_mathtext": True,
 }
 
 
@@ -104,10 +100,9 @@ def panels(
     gap_y: float = 6.0,
     sharex: bool | Literal["col", "row"] = False,
     sharey: bool | Literal["col", "row"] = False,
+    ratios: Sequence[float] | None = None,
 ) -> tuple[Figure, NDArray[np.object_]]:
     """Return a figure and its panels, laid out in millimetres.
-
-    Explicit margins take no time, whereas an automatic layout draws the figure twice.
 
     Parameters
     ----------
@@ -120,6 +115,8 @@ def panels(
     gap_x, gap_y : float
         Between panels.
     sharex, sharey : bool or {"col", "row"}
+    ratios : sequence of float, optional
+        Widths of the columns, in any unit; equal by default.
 
     Returns
     -------
@@ -135,6 +132,7 @@ def panels(
         squeeze=False,
         sharex=sharex,
         sharey=sharey,
+        width_ratios=ratios,
         gridspec_kw={
             "left": left / width,
             "right": 1.0 - right / width,
@@ -147,12 +145,17 @@ def panels(
     return figure, np.asarray(axes, dtype=object)
 
 
-def legend_below(figure: Figure, handles: list[Any], labels: list[str], ncols: int) -> None:
+def legend_below(figure: Figure, handles: Mapping[str, Any], ncols: int) -> None:
     """Put one legend for all panels at the foot of a figure; leave about 4 mm a row for it."""
     figure.legend(
-        handles, labels, loc="lower center", ncols=ncols, borderaxespad=0.2, columnspacing=1.4,
-        labelspacing=0.3,
+        list(handles.values()), list(handles), loc="lower center", ncols=ncols, borderaxespad=0.2,
+        columnspacing=1.4, labelspacing=0.3,
     )  # fmt: skip
+
+
+def caption(figure: str, **facts: Any) -> str:
+    """Say what a figure shows, by the words of ``captions.j2``."""
+    return words("captions.j2", "calib.report.figures", figure=figure, **facts)
 
 
 def note(ax: Axes, text: str, *, x: float = 0.03, y: float = 0.97, **kwargs: Any) -> None:
@@ -164,21 +167,6 @@ def note(ax: Axes, text: str, *, x: float = 0.03, y: float = 0.97, **kwargs: Any
 
 
 _DPI = 150
-# Where the larger end of an axis lies here, its tick labels have no common power of ten
-# (``axes.formatter.limits``).
-_PLAIN = (0.02, 9e3)
-
-
-class _Canvas(FigureCanvasAgg):
-    """Its renderers share what they know of formulas: parsing one takes longer than drawing it."""
-
-    _parser: Any = None
-
-    def get_renderer(self) -> RendererAgg:
-        renderer: RendererAgg = super().get_renderer()  # type: ignore[no-untyped-call]
-        _Canvas._parser = _Canvas._parser or renderer.mathtext_parser
-        renderer.mathtext_parser = _Canvas._parser
-        return renderer
 
 
 def png(plate: Plate) -> bytes:
@@ -187,46 +175,22 @@ def png(plate: Plate) -> bytes:
 
 
 def png_bytes(figure: Figure) -> bytes:
-    """Render a figure, with a palette of 256 colours: a third of the size, no visible loss."""
-    from PIL import Image
-
-    # Bare pixels: as PNG they would be compressed only to be read again.
-    _Canvas(figure)
-    pixels = _saved(figure, format="raw", dpi=_DPI)
-    width, height = (int(inches * _DPI) for inches in figure.get_size_inches())
-    # A palette for the colours that there are, not for a million pixels; most equal the one before.
-    flat = np.frombuffer(pixels, np.uint32)
-    runs = np.flatnonzero(np.concatenate([[True], flat[1:] != flat[:-1]]))
-    colours, which = np.unique(flat[runs], return_inverse=True)
-    full_colour = Image.frombytes("RGBA", (colours.size, 1), colours.tobytes()).convert("RGB")
-    few = full_colour.quantize(256, Image.Quantize.MAXCOVERAGE)
-    indices = np.repeat(np.asarray(few)[0, which], np.diff(runs, append=flat.size))
-    image = Image.frombytes("P", (width, height), indices.tobytes())
-    image.putpalette(few.getpalette() or [])
+    """Render a figure with a palette of 256 colours: a third of the size, no visible loss."""
+    full, small = io.BytesIO(_saved(figure, format="png", dpi=_DPI)), io.BytesIO()
+    few = Image.open(full).convert("RGB").quantize(256)
     # With its resolution, by which a text processor takes it over at its size in print.
-    small = io.BytesIO()
-    image.save(small, format="png", dpi=(_DPI, _DPI))
+    few.save(small, format="png", dpi=(_DPI, _DPI))
     return small.getvalue()
-
-
-def _saved(figure: Figure, **form: Any) -> bytes:
-    """Return a figure as a file of some form, drawn in the project's style."""
-    _set_powers(figure)
-    content = io.BytesIO()
-    with style():
-        figure.savefig(content, **form)
-    return content.getvalue()
-
-
-def _set_powers(figure: Figure) -> None:
-    """Set a common power of ten as a formula, and only that: parsing "0.5" takes milliseconds."""
-    for axes in figure.axes:
-        for axis in (axes.xaxis, axes.yaxis):
-            formatter, ends = axis.get_major_formatter(), np.abs(axis.get_view_interval())
-            if isinstance(formatter, ScalarFormatter):
-                formatter.set_useMathText(not _PLAIN[0] < ends.max() < _PLAIN[1])
 
 
 def pdf_bytes(figure: Figure) -> bytes:
     """Render a figure as PDF: fonts inside as TrueType, no date, so that its hash repeats."""
     return _saved(figure, format="pdf", metadata={"CreationDate": None})
+
+
+def _saved(figure: Figure, **form: Any) -> bytes:
+    """Return a figure as a file of some form, drawn in the project's style."""
+    content = io.BytesIO()
+    with style():
+        figure.savefig(content, **form)
+    return content.getvalue()

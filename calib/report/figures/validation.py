@@ -19,11 +19,12 @@ from calib.report.figures.style import (
     MARKERS,
     ORANGE,
     VERMILION,
+    caption,
     legend_below,
     note,
     panels,
 )
-from calib.report.labels import MINUS, NO_UNIT, axis_of, percent, plain, short, unit_plain
+from calib.report.labels import MINUS, NO_UNIT, axis_of, percent, unit_plain
 from calib.report.numbers import centre_text
 from calib.report.reference import NOTHING, Reference
 from calib.report.rows import (
@@ -74,7 +75,7 @@ def residuals_plate(result: OutputResult) -> Plate:
         strict=True,
     ):  # fmt: skip
         ax.set_title(title, loc="left")
-    legend_below(fig, list(handles.values()), list(handles), 4)
+    legend_below(fig, handles, 4)
     return Plate(fig, "residuals", _residuals_caption(result, fitted, held), "Residuals")
 
 
@@ -146,27 +147,19 @@ def _replicated(ax: Axes, result: OutputResult) -> dict[str, Any]:
 def _residuals_caption(
     result: OutputResult, fitted: Standardised, held: Standardised | None
 ) -> str:
-    n, large = fitted.residual.size, int((np.abs(fitted.residual) > 2.0).sum())
+    noise = result.calibration.problem.noise
     runs, pairs = signs_along(result, fitted.residual)
-    beyond = "As normal scores, b" if result.calibration.problem.noise.student else "B"
-    text = (
-        f"{beyond}eyond 2 noise sds lie {large} of {n} residuals ({short(0.046 * n)} expected); "
-        f"they change sign {runs} times along {axis_of(x_column(result)).name.lower()} "
-        f"where independent ones would do so about {0.5 * pairs:.0f} times."
-    )
     sigma = result.calibration.summary.get("sigma")
-    if sigma is not None:
-        unit = "" if sigma.unit == "1" else f" {unit_plain(sigma.unit)}"
-        scale = " of ln output" if result.calibration.problem.bound.model.response == "log" else ""
-        noise = result.calibration.problem.noise
-        what = "The noise scale" if noise.student else "One noise sd"
-        where = f" at the mean {axis_of(noise.column).name.lower()}" if noise.column else ""
-        text += f" {what} {plain('sigma')}{where} is {centre_text(sigma)}{unit}{scale}."
-    if held is not None:
-        mean = float(held.residual.mean())
-        side = "above" if mean > 0.0 else "below"
-        text += f" Held-out rows (open) lie {short(abs(mean))} noise sds {side} their prediction."
-    return text
+    unit = "" if sigma is None or sigma.unit == "1" else f" {unit_plain(sigma.unit)}"
+    return caption(
+        "residuals", noise=noise, n=fitted.residual.size, runs=runs, pairs=pairs,
+        large=int((np.abs(fitted.residual) > 2.0).sum()),
+        along=axis_of(x_column(result)).name.lower(),
+        sigma=None if sigma is None else f"{centre_text(sigma)}{unit}",
+        noise_axis=axis_of(noise.column) if noise.column else None,
+        log=result.calibration.problem.bound.model.response == "log",
+        held=None if held is None else float(held.residual.mean()),
+    )  # fmt: skip
 
 
 def validation_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Plate:
@@ -190,10 +183,18 @@ def validation_plate(result: OutputResult, *, reference: Reference = NOTHING) ->
         strict=True,
     ):  # fmt: skip
         ax.set_title(title, loc="left")
-    legend_below(fig, list(handles.values()), list(handles), 3)
-    return Plate(
-        fig, "validation", _validation_caption(result), "Validation on rows that were not fitted"
-    )
+    legend_below(fig, handles, 3)
+    v = result.validation
+    said = caption(
+        "validation", s=v.scores, held=held_table(result) is not None,
+        label=result.task.table.label,
+        axis=axis_of(result.calibration.problem.bound.model.output),
+        missing=int(np.isnan(v.scores.relative_error).sum()),
+        outside=bool(ks_distance(v.scores.pit) > pit_half_width(v.draws)),
+        effective=effective_rows(v.draws),
+        refitted=None if v.pareto_k is None else len(v.refitted),
+    )  # fmt: skip
+    return Plate(fig, "validation", said, "Validation on rows that were not fitted")
 
 
 def _pareto(ax: Axes, result: OutputResult) -> dict[str, Any]:
@@ -270,31 +271,3 @@ def _coverage(ax: Axes, result: OutputResult) -> dict[str, Any]:
     ax.set_xlabel("Rows covered (%)")
     ax.set_ylabel("Band (nominal %)")
     return handles
-
-
-def _validation_caption(result: OutputResult) -> str:
-    v, s = result.validation, result.validation.scores
-    axis = axis_of(result.calibration.problem.bound.model.output)
-    held = held_table(result) is not None
-    outside = bool(ks_distance(s.pit) > pit_half_width(v.draws))
-    missing = int(np.isnan(s.relative_error).sum())
-    label = f" ({data_word(result)})" if result.task.table.label else ""
-    who = f"{s.n} held-out rows" if held else f"{s.n} rows, each predicted without itself,"
-    left = f" ({missing} rows near zero are not judged)" if missing else ""
-    cover = "; ".join(f"{100 * c.level:g} % band {c.hits} of {c.n}" for c in s.coverage.values())
-    many = "no row" if s.n_far == 0 else "1 row" if s.n_far == 1 else f"{s.n_far} rows"
-    text = (
-        f"Over {who}{label} the median is wrong by {short(axis.factor * s.rmse)} {axis.unit} rms "
-        "and by "
-        f"{percent(s.max_relative_error)} at most{left}, {many} by more than 6 %. "
-        f"Covered: {cover}. The PIT {'leaves' if outside else 'stays inside'} its 95 % band."
-    )
-    effective = effective_rows(v.draws)
-    if effective < 0.5 * s.n:
-        text += (
-            f" These rows share one curve: they say as much as {short(effective)} independent"
-            f" {'row' if effective < 1.05 else 'rows'}."
-        )
-    if v.pareto_k is not None:
-        text += f" {len(v.refitted)} of {s.n} rows needed a refit (Pareto k above 0.7)."
-    return text

@@ -16,7 +16,7 @@ from calib.data.reader import said_of
 from calib.models import BoundModel
 from calib.models.latex import html
 from calib.report.figures.plate import Plate
-from calib.report.labels import MINUS, joined, percent, short, unbroken
+from calib.report.labels import MINUS, joined, percent, plain, short, unbroken
 from calib.report.numbers import (
     format_number,
     format_value,
@@ -34,6 +34,7 @@ def _known(value: float | None, form: str | int = 3) -> str:
 
 _FILTERS: dict[str, Callable[..., str]] = {
     "unbroken": unbroken,
+    "plain": plain,
     "basename": lambda path: PurePosixPath(path).name,
     "joined": joined,
     "said_of": said_of,
@@ -69,12 +70,21 @@ def template(name: str, package: str = _HERE, *, html: bool = True) -> Template:
     return environment.get_template(name)
 
 
+def words(name: str, package: str, **facts: Any) -> str:
+    """Fill facts into the sentences of a template; its lines are joined."""
+    return _one_line(template(name, package, html=False).render(facts))
+
+
+def _one_line(text: str) -> str:
+    return re.sub(r"[ \n]+", " ", text).strip()
+
+
 def sentences(**filters: Callable[..., str]) -> Callable[..., str]:
     """Return what fills facts into a sentence, a template in a string; its lines are joined."""
     environment = Environment(undefined=StrictUndefined)
     environment.filters |= _FILTERS | filters
     compiled = cache(environment.from_string)
-    return lambda text, **facts: re.sub(r"[ \n]+", " ", compiled(text).render(facts)).strip()
+    return lambda text, **facts: _one_line(compiled(text).render(facts))
 
 
 def data_uri(image: bytes) -> str:

@@ -20,7 +20,7 @@ from calib.inference.estimators import METHODS
 from calib.report.document import Output, outputs
 from calib.report.labels import joined
 from calib.report.numbers import format_number, format_value
-from calib.report.page.template import template
+from calib.report.page.template import template, words
 from calib.report.publish.markup import bibliography, bibtex, cited, to_latex, to_text
 from calib.report.publish.tables import Table, csv_tables, latex_tables, write_csv
 
@@ -105,7 +105,11 @@ def methods(manifest: Mapping[str, Any], found: Sequence[Output]) -> list[Paragr
         )  # fmt: skip
     except UndefinedError as error:
         raise KeyError(str(error)) from None
-    blocks = [_one_line(block) for block in re.split(r"\n\s*\n", text) if block.strip()]
+    blocks = [
+        re.sub(r"[ \n]+", " ", block).strip()
+        for block in re.split(r"\n\s*\n", text)
+        if block.strip()
+    ]
     starts = [0, *(i for i, block in enumerate(blocks) if block.startswith("# "))]
     return [
         (blocks[a][2:] if a else "", tuple(blocks[a + bool(a) : b]))
@@ -115,13 +119,7 @@ def methods(manifest: Mapping[str, Any], found: Sequence[Output]) -> list[Paragr
 
 def likelihood(o: Output) -> str:
     """Say what the likelihood of an output is, with marks."""
-    noise = _NORMAL | o.found.get("noise", {})
-    text = template("likelihood.j2", __name__, html=False).render(o=o, noise=noise)
-    return _one_line(text)
-
-
-def _one_line(text: str) -> str:
-    return re.sub(r"[ \n]+", " ", text).strip()
+    return words("likelihood.j2", __name__, o=o, noise=_NORMAL | o.found.get("noise", {}))
 
 
 def _words(o: Output) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import os
 import re
@@ -16,17 +17,12 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from calib.he2019.published import HE2019
 from calib.report.figures.bands import FILLS
-from calib.report.figures.collect import plates
 from calib.report.figures.plate import Plate
 from calib.report.figures.style import (
-    BLACK,
     CYCLE,
     DASHES,
     DOUBLE_MM,
-    EMBER,
-    GREY,
     MARKERS,
     MIDDLE_MM,
     SINGLE_MM,
@@ -35,8 +31,7 @@ from calib.report.figures.style import (
     png_bytes,
     style,
 )
-
-WIDTHS = (SINGLE_MM, MIDDLE_MM, DOUBLE_MM)
+from calib.report.page.template import png_size
 
 
 @pytest.fixture(scope="module")
@@ -63,70 +58,40 @@ def words(figure: Figure) -> list[Text]:
     ]  # fmt: skip
 
 
-def test_widths_are_those_of_a_journal(drawn):
+def test_text_is_read_in_print_and_hides_nothing(drawn):
+    """In a journal's widths no text is too small, cut off, too pale or over another."""
     for name, p in drawn.items():
         width, height = p.figure.get_size_inches() * 25.4
-        assert min(abs(width - w) for w in WIDTHS) < 0.01, (name, width)
+        assert min(abs(width - w) for w in (SINGLE_MM, MIDDLE_MM, DOUBLE_MM)) < 0.01, (name, width)
         assert height < 240.0, name
-
-
-def test_no_text_is_too_small(drawn):
-    for name, p in drawn.items():
-        for t in words(p.figure):
+        seen, edge = [(t, t.get_window_extent()) for t in words(p.figure)], p.figure.bbox
+        for t, box in seen:
             assert t.get_fontsize() >= SMALLEST_PT, (name, t.get_text())
             if re.search(r"\$.*[_^].*\$", t.get_text()):
                 # Matplotlib sets subscripts at 0.7 of the size: 6 pt is the least in journals.
                 assert 0.7 * t.get_fontsize() >= 6.0, (name, t.get_text())
-
-
-def test_no_text_collides_with_another(drawn):
-    for name, p in drawn.items():
-        boxes = [(t.get_text(), t.get_window_extent().padded(-0.5)) for t in words(p.figure)]
-        for (a, one), (b, other) in itertools.combinations(boxes, 2):
+            assert contrast(t.get_color(), "white") >= 4.5, (name, t.get_text())
+            assert edge.x0 <= box.x0 <= box.x1 <= edge.x1, (name, t.get_text())
+            assert edge.y0 <= box.y0 <= box.y1 <= edge.y1, (name, t.get_text())
+        for (a, one), (b, other) in itertools.combinations(seen, 2):
             width = min(one.x1, other.x1) - max(one.x0, other.x0)
             height = min(one.y1, other.y1) - max(one.y0, other.y0)
-            assert width <= 0.0 or height <= 0.0, (name, a, b)
-
-
-def test_no_text_leaves_its_figure(drawn):
-    for name, p in drawn.items():
-        inside = p.figure.bbox
-        for t in words(p.figure):
-            box = t.get_window_extent()
-            assert box.x0 >= inside.x0, (name, t.get_text())
-            assert box.y0 >= inside.y0, (name, t.get_text())
-            assert box.x1 <= inside.x1, (name, t.get_text())
-            assert box.y1 <= inside.y1, (name, t.get_text())
-
-
-def test_a_legend_hides_no_data(drawn):
-    for name, p in drawn.items():
+            assert width <= 1.0 or height <= 1.0, (name, a.get_text(), b.get_text())
         for legend in p.figure.legends:
             box = legend.get_window_extent()
             for ax in p.figure.axes:
                 if ax.get_visible() and ax.axison:
                     assert not box.overlaps(ax.get_window_extent()), name
-        assert all(ax.get_legend() is None for ax in p.figure.axes), name
-
-
-def luminance(colour: str) -> float:
-    """Relative luminance (WCAG 2.2)."""
-    c = np.array(to_rgb(colour))
-    linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
-    return float(linear @ [0.2126, 0.7152, 0.0722])
 
 
 def contrast(one: str, other: str) -> float:
-    low, high = sorted((luminance(one), luminance(other)))
-    return (high + 0.05) / (low + 0.05)
-
-
-def test_words_have_contrast(drawn):
-    assert contrast(BLACK, "white") == pytest.approx(21.0)
-    assert min(contrast(c, "white") for c in (EMBER, GREY)) >= 4.5
-    for name, p in drawn.items():
-        for t in words(p.figure):
-            assert contrast(t.get_color(), "white") >= 4.5, (name, t.get_text())
+    """Contrast of two colours (WCAG 2.2)."""
+    found = []
+    for colour in (one, other):
+        c = np.array(to_rgb(colour))
+        linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+        found.append(float(linear @ [0.2126, 0.7152, 0.0722]))
+    return (max(found) + 0.05) / (min(found) + 0.05)
 
 
 def seen(colour: str, deficiency: str | None) -> np.ndarray:
@@ -156,53 +121,44 @@ def test_bands_are_told_apart_by_lightness_alone(deficiency):
     assert (steps > 4.0).all(), steps
 
 
-def test_a_palette_that_some_cannot_tell_apart_is_found():
-    red, green = seen("#d62728", "deuteranomaly"), seen("#6b8e23", "deuteranomaly")
-    assert np.linalg.norm(red - green) < 12.0
-    assert np.linalg.norm(seen("#d62728", None) - seen("#6b8e23", None)) > 30.0
-
-
-def test_a_pdf_has_the_same_bytes_every_time(drawn, rut):
-    first = pdf_bytes(drawn["rut estimates"].figure)
-    again = next(p for p in plates(rut, reference=HE2019) if p.name == "estimates")
-    assert pdf_bytes(again.figure) == first
-    assert b"CreationDate" not in first
-
-
 def test_a_pdf_has_true_type_fonts_and_its_size_in_print(drawn):
     figure = drawn["drawbar bands"].figure
     content = pdf_bytes(figure)
     assert b"/Subtype /Type3" not in content
     assert b"/FontFile2" in content
+    assert b"CreationDate" not in content
     box = re.search(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", content)
     assert float(box[1]) / 72.0 * 25.4 == pytest.approx(DOUBLE_MM, abs=0.01)
+    theirs = {"savefig.bbox": "tight", "pdf.fonttype": 3, "ytick.labelsize": 20.0}
+    plain = png_bytes(figure)
+    with mpl.rc_context(theirs):
+        assert (pdf_bytes(figure), png_bytes(figure)) == (content, plain)
+        with style():
+            assert mpl.rcParams["pdf.fonttype"] == 42
+        assert mpl.rcParams["pdf.fonttype"] == 3
 
 
-def test_a_pdf_does_not_depend_on_the_process(capsys):
+def test_files_depend_neither_on_the_process_nor_on_what_was_drawn_before():
     code = (
         "import hashlib\n"
-        "from calib.report.figures.style import pdf_bytes\n"
-        "from calib.report.figures.style import panels, style\n"
+        "from calib.report.figures.style import panels, pdf_bytes, png_bytes, style\n"
         "with style():\n"
         "    figure, axes = panels(1, 1, height=30.0)\n"
         "    axes[0, 0].plot([0, 1], [1, 0], label='a')\n"
         "    axes[0, 0].set_xlabel(r'$\\gamma_\\mathrm{ref}$ (g/cm$^{3}$)')\n"
-        "print(hashlib.sha256(pdf_bytes(figure)).hexdigest())\n"
+        "content = png_bytes(figure) + pdf_bytes(figure)\n"
     )
     other = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True,
-        env=os.environ | {"PYTHONHASHSEED": "1"},
+        [sys.executable, "-c", code + "print(hashlib.sha256(content).hexdigest())"],
+        capture_output=True, text=True, check=True, env=os.environ | {"PYTHONHASHSEED": "1"},
     ).stdout  # fmt: skip
-    exec(code, {})
-    assert capsys.readouterr().out == other
+    found: dict[str, bytes] = {}
+    exec(code, found)
+    assert hashlib.sha256(found["content"]).hexdigest() == other.strip()
+    assert png_size(found["content"])[0] == int(DOUBLE_MM / 25.4 * 150)
 
 
-@pytest.mark.parametrize("to_bytes", [pdf_bytes, png_bytes])
-def test_the_users_settings_do_not_reach_a_file(drawn, to_bytes):
-    figure = drawn["drawbar bands"].figure
-    plain = to_bytes(figure)
-    theirs = {"savefig.bbox": "tight", "pdf.fonttype": 3, "ytick.labelsize": 20.0}
-    with mpl.rc_context(theirs):
-        assert to_bytes(figure) == plain
-    with style():
-        assert mpl.rcParams["pdf.fonttype"] == 42
+def test_the_page_of_a_diagnosis_needs_no_study():
+    code = "import sys, calib.report.page.diagnosis; print('calib.report.study' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True)
+    assert done.stdout.strip() == "False"
