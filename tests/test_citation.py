@@ -10,7 +10,7 @@ import pytest
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from calib.report.publish.markup import entries
+from calib.report.markup import entries
 
 ROOT = Path(__file__).parents[1]
 

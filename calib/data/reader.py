@@ -456,7 +456,7 @@ class KnownData:
     words : str
         What it is, in a sentence.
     methods : str
-        What a paper must say of it, a sentence with marks (`calib.report.publish.markup`).
+        What a paper must say of it, a sentence with marks (`calib.report.markup`).
     holds : callable
         ``table -> bool``: whether all rows of a table are rows of it.
     """

@@ -41,10 +41,10 @@ from calib.report.figures.plate import Plate
 from calib.report.gap_evidence import gap_verdict
 from calib.report.gap_facts import short_name
 from calib.report.labels import odds_text, percent, percent_range, unbroken
+from calib.report.markup import unit_html
 from calib.report.numbers import NOTHING, format_number
 from calib.report.page.diagnosis import TONE_MARKS, render_diagnosis
 from calib.report.page.template import data_uri, picture, png_size, sentences, template
-from calib.report.publish.markup import unit_html
 from calib.report.sections import Section, Target
 from calib.report.study import Progress, Study
 

@@ -178,7 +178,7 @@ class Model:
     latex : tuple of str
         The equation, in the mathematics of `calib.models.latex`, and where it helps its parts.
     letters : str
-        What its letters mean that are not parameters, with marks of `calib.report.publish.markup`.
+        What its letters mean that are not parameters, with marks of `calib.report.markup`.
     applies : str
         When it applies, and its limits, in plain sentences.
     numbers : str

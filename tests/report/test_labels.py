@@ -17,7 +17,7 @@ from calib.report.labels import (
     unit_text,
     units_of,
 )
-from calib.report.publish.markup import latex_unit, unit_html
+from calib.report.markup import latex_unit, unit_html
 
 MINUS = "\N{MINUS SIGN}"
 TIMES = "\N{MULTIPLICATION SIGN}"

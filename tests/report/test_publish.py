@@ -20,9 +20,7 @@ from hypothesis import strategies as st
 from calib.he2019.published import DOI, PUBLISHED
 from calib.models import MODELS
 from calib.report.document import outputs
-from calib.report.numbers import TIMES, interval_text, last_place
-from calib.report.publish import publication
-from calib.report.publish.markup import (
+from calib.report.markup import (
     bibliography,
     bibtex,
     cited,
@@ -38,6 +36,8 @@ from calib.report.publish.markup import (
     unit_html,
     with_symbols,
 )
+from calib.report.numbers import TIMES, interval_text, last_place
+from calib.report.publish import publication
 from tests.report.latex import check, columns, rows
 
 # Sentences with marks
@@ -109,7 +109,7 @@ def test_every_model_has_its_equation(name):
 
 
 def test_every_entry_was_read():
-    source = (resources.files("calib.report.publish") / "references.bib").read_text("utf-8")
+    source = (resources.files("calib.report") / "references.bib").read_text("utf-8")
     assert len(re.findall(r"^@", source, re.MULTILINE)) == len(entries())
     for key, entry in entries().items():
         assert set(entry) >= {"author", "title", "journal", "year", "volume", "pages"}, key

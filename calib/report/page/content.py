@@ -14,10 +14,10 @@ from markupsafe import Markup
 from calib.models import MODELS
 from calib.report.document import Output, outputs, page_facts
 from calib.report.figures.collect import Drawn
+from calib.report.markup import prose, to_html
 from calib.report.numbers import TIMES
 from calib.report.page.template import equation, parametrisation, picture, template
 from calib.report.publish import Publication, likelihood
-from calib.report.publish.markup import prose, to_html
 from calib.report.publish.tables import (
     TICK,
     Table,

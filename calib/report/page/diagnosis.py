@@ -48,10 +48,10 @@ from calib.report.gap_facts import (
 )
 from calib.report.gap_verdict import Tone, advice, judge_gap, repeats_needed
 from calib.report.labels import MINUS, odds_text, percent, percent_range, short
+from calib.report.markup import prose
 from calib.report.numbers import format_value
 from calib.report.page.template import equation, parametrisation, picture, template
 from calib.report.parameters import parameter_text, unit_of
-from calib.report.publish.markup import prose
 
 # A hypothesis or a cause that is less probable is ruled out.
 _POSSIBLE = 0.01

@@ -19,13 +19,13 @@ from calib.data.reader import KNOWN_DATA
 from calib.inference.estimators import METHODS
 from calib.report.document import Output, outputs
 from calib.report.labels import joined
+from calib.report.markup import bibliography, bibtex, cited, to_latex, to_text
 from calib.report.numbers import format_number, format_value
 from calib.report.page.template import template, words
-from calib.report.publish.markup import bibliography, bibtex, cited, to_latex, to_text
 from calib.report.publish.tables import Table, csv_tables, latex_tables, write_csv
 
 type Paragraph = tuple[str, tuple[str, ...]]
-"""A heading, empty for the first, and sentences with marks (`calib.report.publish.markup`)."""
+"""A heading, empty for the first, and sentences with marks (`calib.report.markup`)."""
 
 _NORMAL: Mapping[str, Any] = {
     "family": "", "correlated_along": "", "depends_on": None, "against_normal": None,

@@ -1,7 +1,7 @@
 """The tables of a report, each declared once: for the page, for LaTeX and for programs.
 
 To add one, write a function that returns it and list it in `TOPICS`. Cells, heads and captions are
-text with marks (`calib.report.publish.markup`).
+text with marks (`calib.report.markup`).
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from calib.inference.calibration import ParameterSummary
 from calib.inference.estimators import METHODS, method_name
 from calib.report.document import Output
+from calib.report.markup import to_latex, with_symbols
 from calib.report.numbers import (
     NOTHING,
     ascii_number,
@@ -29,7 +30,6 @@ from calib.report.numbers import (
     last_place,
     skewed,
 )
-from calib.report.publish.markup import to_latex, with_symbols
 from calib.report.reference import Figure
 
 TICK = "\N{CHECK MARK}"

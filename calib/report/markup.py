@@ -118,7 +118,7 @@ _NAMED = 3
 
 @cache
 def _source() -> str:
-    return (resources.files("calib.report.publish") / "references.bib").read_text(encoding="utf-8")
+    return (resources.files("calib.report") / "references.bib").read_text(encoding="utf-8")
 
 
 @cache
