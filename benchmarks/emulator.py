@@ -32,8 +32,8 @@ from calib.inference.emulation import EmulationSettings, emulate
 from calib.inference.emulation.prepared import prepare, prepare_field
 from calib.inference.emulation.state import State
 from calib.inference.problem import Problem
-from calib.models.simulators.registered import SIMULATED
-from calib.models.simulators.runs import RunKeeper
+from calib.models.simulators.declaration import SIMULATED
+from calib.models.simulators.simulator import RunKeeper
 
 SEEDS = (11, 12, 13)
 BUDGETS = (60, 100, 200)

@@ -29,8 +29,7 @@ if TYPE_CHECKING:
     from calib.inference.problem import Problem, build_problem
     from calib.inference.sampler import SamplerSettings
     from calib.models import MODELS, Model
-    from calib.models.simulators.files import read_simulator
-    from calib.models.simulators.registered import from_callable
+    from calib.models.simulators.declaration import from_callable, read_simulator
     from calib.report.gap_evidence import gap_verdict
     from calib.report.verdict import Verdict, verdict
     from calib.validation.prediction import Prediction, predict
@@ -54,8 +53,8 @@ _HOME = {
     "CalibError": "calib.errors",
     "Emulation": "calib.inference.emulation",
     "emulated": "calib.inference.emulation.prepared",
-    "from_callable": "calib.models.simulators.registered",
-    "read_simulator": "calib.models.simulators.files",
+    "from_callable": "calib.models.simulators.declaration",
+    "read_simulator": "calib.models.simulators.declaration",
     "PointEstimate": "calib.inference.estimators",
     "estimate": "calib.inference.estimators",
     "Case": "calib.gap.case",

@@ -30,15 +30,13 @@ def problem_of(
     The last prior is that of sigma.
     """
 
-    def mean_response(columns, rows, references):
-        return np.asarray(function(*columns, rows["slip_ratio"]))
+    def mean_response(conditions, **parameters):
+        return np.asarray(function(*parameters.values(), conditions["slip_ratio"]))
 
     names = tuple(p.name for p in priors)[:-1]
     model = Model(
         name="custom", title="a test", output="drawbar_pull_kn",
-        conditions=("slip_ratio",), parameters=names, reported={}, response="identity",
-        mean_response=mean_response, report_theta=lambda theta, references: {},
-        theta_from_reported=lambda reported, references: np.empty(0),
+        conditions=("slip_ratio",), parameters=names, mean_response=mean_response,
     )  # fmt: skip
     table = table_from_arrays({"slip_ratio": slip, "drawbar_pull_kn": pull})
     return Problem(model.bind(table.columns), table, Priors(tuple(priors)))

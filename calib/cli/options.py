@@ -48,7 +48,7 @@ Scheduler = Annotated[
 def _load(paths: list[Path] | None) -> list[Path] | None:
     """Register what the files declare, before names are looked up."""
     if paths:
-        from calib.models.simulators.files import load_files
+        from calib.models.simulators.declaration import load_files
 
         load_files(paths)
     return paths
@@ -254,7 +254,7 @@ def say_failed(model: str) -> None:
     """Say which runs failed of a simulator that the sampler asked itself, and list them."""
     from calib.inference.emulation.prepared import write_failed
     from calib.models import get_model
-    from calib.models.simulators.registered import Direct, simulated_by
+    from calib.models.simulators.declaration import Direct, simulated_by
 
     direct, found = get_model(model).predict, simulated_by(model)
     if not isinstance(direct, Direct) or found is None or not direct.tally.failed:

@@ -147,9 +147,6 @@ class CaseSimulator:
         self._emulator = emulator_of(self._bound.model)
         self._mix = self._error_of(self.both)
         self.n_errors = self._mix.shape[1]
-        self._known = [
-            (c, (self._bound.prepare(c), self._bends(c))) for c in (self.lab, self.field, self.both)
-        ]
 
     def conditions(self, view: View) -> dict[str, Array]:
         """Return the model's conditions of a view."""
@@ -168,10 +165,8 @@ class CaseSimulator:
             The former in the unit of the response.
         conditions : mapping of str to ndarray, shape (n,) or (k, n)
         """
-        prepared = (found for known, found in self._known if known is conditions)
-        rows, bends = next(prepared, None) or (None, self._bends(conditions))
-        mean = self._bound.mean_response(self._priors.to_natural(t), conditions, rows)
-        for column, bend in enumerate(bends):
+        mean = self._bound.mean_response(self._priors.to_natural(t), conditions)
+        for column, bend in enumerate(self._bends(conditions)):
             mean = mean + misfit[:, column : column + 1] * bend
         return mean
 

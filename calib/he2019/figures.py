@@ -20,8 +20,8 @@ from calib.he2019.audit.pull import features
 from calib.he2019.audit.regressions import InverseStudy, attenuation
 from calib.he2019.gaps import FoundGap
 from calib.models.base import Array
-from calib.models.bekker import rut_depth
 from calib.models.magic_formula import magic_formula
+from calib.models.soil import rut_depth
 from calib.report.figures.gap import probability_text
 from calib.report.figures.plate import Plate, draw_all
 from calib.report.figures.style import (

@@ -41,7 +41,7 @@ from calib.inference.mode import find_modes
 from calib.inference.proposal import Guess, adapt
 from calib.inference.random import generator
 from calib.models.base import Array
-from calib.models.bekker import rut_depth as eq_21
+from calib.models.soil import rut_depth as eq_21
 from calib.report.study import Progress
 
 RECONSTRUCTED = "the data are reconstructed from published results; they are not measurements"

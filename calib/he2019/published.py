@@ -21,10 +21,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from calib.he2019 import declared
-from calib.models.ayers_perumpral import bulk_density
 from calib.models.base import Array, BoundModel
-from calib.models.bekker import rut_depth
 from calib.models.magic_formula import magic_formula
+from calib.models.soil import bulk_density, rut_depth
 from calib.report.reference import Figure, FittedTable, Limit, Reference
 
 LABEL = "reconstructed"

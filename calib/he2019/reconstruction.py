@@ -43,9 +43,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.he2019.published import PUBLISHED
-from calib.models.ayers_perumpral import bulk_density as eq_1
-from calib.models.bekker import rut_depth as eq_21
 from calib.models.magic_formula import magic_formula
+from calib.models.soil import bulk_density as eq_1
+from calib.models.soil import rut_depth as eq_21
 
 type Array = NDArray[np.float64]
 type Conditions = Callable[[Array], tuple[Array, Array]]

@@ -20,7 +20,7 @@ from calib.inference.random import generator
 from calib.models.base import Array
 
 if TYPE_CHECKING:
-    from calib.models.simulators.base import Simulator
+    from calib.models.simulators.simulator import Simulator
 
 
 def prior_design(problem: Problem, count: int, seed: int, *, latin: bool = False) -> Array:
@@ -67,15 +67,15 @@ def try_simulator(problem: Problem) -> None:
     if direct is None:
         return
     # They take some time to import: only where a function is behind the model.
-    from calib.models.simulators.registered import Direct
-    from calib.models.simulators.runs import FIRST
+    from calib.models.constants import FIRST_RUNS
+    from calib.models.simulators.declaration import Direct
 
     if not isinstance(direct, Direct):
         _check_repeats(problem, prior_middle(problem), f"model {problem.bound.model.name}")
         return
     if direct.simulator.emulate or direct.tally.tried:
         return
-    spread = prior_design(problem, FIRST, 0)
+    spread = prior_design(problem, FIRST_RUNS, 0)
     thetas = np.concatenate([prior_middle(problem), spread])
     with _told_if_long(direct.simulator):
         direct.try_first(thetas, problem.conditions)

@@ -47,14 +47,14 @@ from calib.data import Table
 from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
 from calib.inference.constants import HALF_LN_2PI, PARALLEL_CELLS, SHORT_TILE, TILE_CELLS
-from calib.models.base import Array, BoundModel, Conditions, Rows, columns
+from calib.models.base import Array, BoundModel, Conditions
 
 
 @dataclass(frozen=True)
 class _Tile:
     """Rows that are evaluated together."""
 
-    rows: Rows
+    conditions: Conditions
     response: Array
     """Mean response at each distinct condition."""
     repeats: Array | None
@@ -86,9 +86,7 @@ class Squares:
     ) -> Squares:
         """Arrange conditions and responses (n,) for a bound model, a thread for each processor."""
         distinct, mean, repeats, within = _distinct(conditions, response)
-        tiles = tuple(
-            _tile(bound, distinct, mean, repeats, rows) for rows in _blocks(distinct, mean.size)
-        )
+        tiles = tuple(_tile(distinct, mean, repeats, rows) for rows in _blocks(distinct, mean.size))
         return cls(bound, tiles, mean.size, within, threads or _processors())
 
     def __call__(self, theta: Array) -> Array:
@@ -119,17 +117,14 @@ def _evaluate(bound: BoundModel, tile: _Tile, theta: Array, out: Array) -> None:
     # Threads have their own error state. Bad vectors come out as NaN.
     with np.errstate(all="ignore"):
         for i in range(0, theta.shape[0], at_once):
-            some = columns(theta[i : i + at_once])
-            r = bound.model.mean_response(some, tile.rows, bound.references) - tile.response
+            r = bound.mean_response(theta[i : i + at_once], tile.conditions) - tile.response
             r *= r
             out[i : i + at_once] = r.sum(axis=1) if tile.repeats is None else r @ tile.repeats
 
 
-def _tile(
-    bound: BoundModel, distinct: Conditions, mean: Array, repeats: Array | None, rows: slice
-) -> _Tile:
-    prepared = bound.prepare({name: v[rows] for name, v in distinct.items()})
-    return _Tile(prepared, mean[rows], None if repeats is None else repeats[rows])
+def _tile(distinct: Conditions, mean: Array, repeats: Array | None, rows: slice) -> _Tile:
+    conditions = {name: v[rows] for name, v in distinct.items()}
+    return _Tile(conditions, mean[rows], None if repeats is None else repeats[rows])
 
 
 def _distinct(

@@ -47,7 +47,7 @@ from calib.inference.prior_files import (
 from calib.inference.priors import Priors, prior_references
 from calib.inference.random import generator
 from calib.models import Array, BoundModel, Conditions, get_model
-from calib.models.simulators.registered import simulated_by
+from calib.models.simulators.declaration import simulated_by
 
 
 def check_scale(problem: Problem, assumed: Mapping[str, float]) -> None:

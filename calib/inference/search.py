@@ -220,9 +220,9 @@ class Found(NamedTuple):
 class SearchSpace:
     """Coordinates, box and cost of a search for the free parameters of a problem.
 
-    The box, (d,) each, is in natural units of ``B`` and ``E`` in the place of ``K`` and ``G`` for
-    the Magic Formula at one pressure, as in the source; else in the prior's internal coordinates,
-    so that log-normal parameters are searched on their logarithm.
+    The box, (d,) each, is in published parameters for a model that says so (`Model.searched`); else
+    in the prior's internal coordinates, so that log-normal parameters are searched on their
+    logarithm.
     """
 
     problem: Problem
@@ -233,14 +233,14 @@ class SearchSpace:
     def natural(self, x: Array) -> Array:
         """Natural parameters, the noise scale last, of coordinates (k, d)."""
         priors = self.problem.priors
-        other = self.problem.bound.model.searched
-        if other is None:
+        model = self.problem.bound.model
+        if not model.searched:
             return priors.to_natural(x)
-        searched = dict(zip(self.names, x.T, strict=True))
-        value: dict[str, Any] = {p.name: searched.get(p.name, p.loc) for p in priors.entries}
-        value |= {name: searched[name] for name in other.names.values() if name in searched}
-        found = other.sampled(value)
-        columns = [found[p.name] for p in priors.entries]
+        held = {p.name: p.loc for p in priors.entries}
+        value = dict.fromkeys(model.reported, np.nan) | held
+        value |= dict(zip(self.names, x.T, strict=True))
+        value |= dict(zip(model.parameters, self.problem.bound.theta(value).T, strict=True))
+        columns = [(value if name in self.problem.names else held)[name] for name in held]
         return np.stack(np.broadcast_arrays(x[:, 0], *columns)[1:], axis=1)
 
     def cost(self, x: Array) -> Array:
@@ -277,13 +277,18 @@ def search_space(problem: Problem, box: Box | None = None) -> SearchSpace:
     per percent, C from 1 to 2, D from 0 to twice the largest pull and E from -30 to 1 for the Magic
     Formula at one pressure; for all other parameters the central 99.8 % interval of the prior.
     """
-    other = problem.bound.model.searched
-    names = tuple(other.names.get(n, n) if other else n for n in problem.names)
+    model = problem.bound.model
+    other = model.searched
+    published = dict(zip(model.parameters, model.reported, strict=False)) if other else {}
+    names = tuple(published.get(n, n) for n in problem.names)
     low, high = central_interval(problem)
-    logs = [p.log and other is None for p in problem.priors.free]
+    logs = [p.log and not other for p in problem.priors.free]
     _check_box(box or {}, names)
     largest = float(np.abs(problem.response).max())
-    given = (other.box(largest) if other else {}) | dict(box or {})
+    unit = QUANTITIES[model.output].unit
+    sizes = {name: largest if model.reported[name] == unit else 1.0 for name in other}
+    given = {name: (a * sizes[name], b * sizes[name]) for name, (a, b) in other.items()}
+    given |= dict(box or {})
     for j, name in enumerate(names):
         if name in given:
             ends = np.array(given[name], dtype=np.float64)

@@ -6,19 +6,8 @@ from pathlib import Path
 
 from calib.data.registry import Registry
 from calib.errors import CalibError, meant
-from calib.models.ayers_perumpral import AYERS_PERUMPRAL, AYERS_PERUMPRAL_VOLUMETRIC
+from calib.models import magic_formula, soil, traction, wong_reece
 from calib.models.base import Array, BoundModel, Conditions, Model, References
-from calib.models.bekker import BEKKER, BEKKER_PLATE, LYASKO, MODIFIED_BEKKER, REECE
-from calib.models.magic_formula import MAGIC_FORMULA, MAGIC_FORMULA_PRESSURE
-from calib.models.traction import (
-    BRIXIUS,
-    ELLIPTIC_CONTACT,
-    JANOSI_HANAMOTO,
-    MACLAURIN_RUT,
-    UPADHYAYA,
-    WISMER_LUTH,
-)
-from calib.models.wong_reece import WONG_REECE_PULL, WONG_REECE_SINKAGE, WONG_REECE_TORQUE
 
 __all__ = [
     "MODELS", "Array", "BoundModel", "Conditions", "Model", "References", "example_csv",
@@ -28,24 +17,11 @@ __all__ = [
 MODELS: Registry[Model] = Registry(
     "model",
     lambda model: model.name,
-    AYERS_PERUMPRAL,
-    AYERS_PERUMPRAL_VOLUMETRIC,
-    MAGIC_FORMULA,
-    MAGIC_FORMULA_PRESSURE,
-    BEKKER,
-    MODIFIED_BEKKER,
-    BEKKER_PLATE,
-    REECE,
-    LYASKO,
-    MACLAURIN_RUT,
-    WISMER_LUTH,
-    BRIXIUS,
-    UPADHYAYA,
-    ELLIPTIC_CONTACT,
-    JANOSI_HANAMOTO,
-    WONG_REECE_PULL,
-    WONG_REECE_TORQUE,
-    WONG_REECE_SINKAGE,
+    *soil.MODELS[:2],
+    *magic_formula.MODELS,
+    *soil.MODELS[2:],
+    *traction.MODELS,
+    *wong_reece.MODELS,
     group="terracalib.models",
 )
 

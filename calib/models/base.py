@@ -1,9 +1,9 @@
-"""What every model is: equations over parameter vectors, bound to reference conditions.
+"""What every model is: an equation over named parameters and conditions, and what is known of it.
 
-A `Model` holds pure functions. Binding it to calibration data fixes the *reference conditions*
-(a cone index, a ground pressure, the two end pressures) about which its sampled parameters are
-defined: parameters at a condition that was measured are far better conditioned than the
-published coefficients, which are reported beside them.
+Binding a model to calibration data fixes the *reference conditions* (a cone index, a ground
+pressure, the two end pressures) about which its sampled parameters are defined: parameters at a
+condition that was measured are far better conditioned than the published coefficients, which are
+reported beside them.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import traceback
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 from unicodedata import normalize
 
 import numpy as np
@@ -23,132 +23,29 @@ from calib.batch.user_code import call
 from calib.data.files import MEND_TOML, real_array
 from calib.data.quantities import OUTPUTS, QUANTITIES, convert
 from calib.errors import CalibError
-from calib.models.latex import text
 
 type Array = NDArray[np.float64]
 type References = Mapping[str, float]
 type Conditions = Mapping[str, Array]
-type Columns = tuple[Array, ...]
-# The part of an equation that depends on the conditions alone; see `Model.prepare`.
-type Rows = Mapping[str, NDArray[Any]]
+type Parameters = Mapping[str, Any]
 
 
-def columns(theta: Array) -> Columns:
-    """Split parameter vectors (k, d) into columns (k, 1), to broadcast against conditions."""
-    return tuple(theta[:, j, None] for j in range(theta.shape[1]))
-
-
-def _no_references(conditions: Conditions) -> dict[str, float]:
-    return {}
-
-
-def not_given(*_: Any) -> Any:
-    """Stand for a function that `Model` fills in."""
-    raise NotImplementedError
-
-
-@dataclass(frozen=True)
-class _Predicted:
-    """The mean response of a model that declares `predict`."""
-
-    model: Model
-
-    def __call__(self, columns: Columns, rows: Rows, references: References) -> Array:
-        theta = np.concatenate(columns, axis=1)
-        shape = np.broadcast_shapes(*(v.shape for v in rows.values()))
-        if len(shape) == 1:
-            return self._call(theta, rows)
-        # Each vector has conditions of its own. Most functions broadcast them, which is faster.
-        k = max(len(theta), shape[0])
-        theta = np.broadcast_to(theta, (k, theta.shape[1]))
-        own = {name: np.broadcast_to(v, (k, shape[1])) for name, v in rows.items()}
-
-        def one(i: int) -> Array:
-            return self._call(theta[i : i + 1], {name: v[i] for name, v in own.items()})
-
-        first = one(0)
-        try:
-            found = self._call(theta, own) if k > 1 else first
-            if np.allclose(found[0], first[0], 1e-12, 0.0, equal_nan=True):
-                return found
-        except CalibError:
-            pass
-        return np.concatenate([first, *(one(i) for i in range(1, k))])
-
-    def _call(self, theta: Array, rows: Rows) -> Array:
-        if self.model.predict is None:
-            raise CalibError(
-                f"the model {self.model.name} has no predict",
-                expected="predict(theta (k, d), conditions) -> (k, n)",
-                hint="declare it with a function that predicts its output",
-            )
-        # Copies, as a function may change its arguments.
-        handed = theta.copy(), {name: v.copy() for name, v in rows.items()}
-        try:
-            given = call(self.model.predict, *handed)
-        except CalibError:
-            raise
-        except (Exception, SystemExit) as error:  # of the user's own code
-            frame = traceback.extract_tb(error.__traceback__)[-1]
-            raise CalibError(
-                f"predict of the model {self.model.name} fails: {type(error).__name__}: {error}",
-                where=f"{frame.filename}, line {frame.lineno}",
-                expected=f"conditions {', '.join(self.model.conditions)}; parameters in columns of "
-                f"theta (k, {len(self.model.parameters)})",
-                hint="correct the function",
-            ) from error
-        try:
-            found = real_array(given, QUANTITIES[self.model.output].unit)
-        except CalibError as error:
-            raise error.within(f"predict of the model {self.model.name}") from None
-        n = next(iter(rows.values())).shape[-1]
-        if found.shape != (theta.shape[0], n):
-            raise CalibError(
-                f"predict of the model {self.model.name} returned the shape {found.shape}",
-                expected=f"(vectors, rows) = ({theta.shape[0]}, {n})",
-                hint="theta[:, :1] is the first parameter as a column, (vectors, 1)",
-            )
-        return np.log(found) if self.model.response == "log" else found
-
-
-def _by_name(names: tuple[str, ...], theta: Array, references: References) -> dict[str, Array]:
-    """Report the sampled parameters as they are."""
-    return dict(zip(names, theta.T, strict=True))
-
-
-def _vector(names: tuple[str, ...], reported: Mapping[str, float], references: References) -> Array:
-    """Return one vector of parameters by name, the inverse of `_by_name`."""
-    return np.array([reported[name] for name in names])
-
-
-def _as_they_are(conditions: Conditions, references: References) -> Rows:
-    return conditions
-
-
-@dataclass(frozen=True)
-class Searched:
-    """Coordinates in which population methods search a model, in the place of its prior's.
-
-    `names` maps sampled parameters to the published ones that are searched for them, `box` is
-    ``largest response -> {name: (lower, upper)}``, and `sampled` turns searched values, by name,
-    into sampled ones.
-    """
-
-    names: Mapping[str, str]
-    box: Callable[[float], dict[str, tuple[float, float]]]
-    sampled: Callable[[dict[str, Any]], dict[str, Any]]
-
-
-@dataclass(frozen=True)
-class Alone:
-    """A simpler model, fitted to each value of a condition, to compare with a joint one.
-
-    Some of its parameters are held.
-    """
+class Alone(NamedTuple):
+    """A simpler model to be fitted at each value of a condition, some of its parameters held."""
 
     column: str
     model: str
-    fixed: Mapping[str, float]
+    fixed: dict[str, float]
+
+
+def no_references(conditions: Conditions) -> dict[str, float]:
+    """Bind no reference conditions."""
+    return {}
+
+
+def as_they_are(references: References, /, **parameters: Any) -> Parameters:
+    """Publish parameters as they are sampled."""
+    return parameters
 
 
 @dataclass(frozen=True)
@@ -156,7 +53,8 @@ class Model:
     """An equation that predicts an output from conditions, and all that is known of it.
 
     A model of one's own needs `name`, `title`, `output`, `conditions`, `parameters`, `predict`,
-    `priors` and, for a template and simulation-based calibration, an `example`.
+    `priors` and, for a template and simulation-based calibration, an `example`. Of the shipped
+    models all but the functions is in their cards (`calib.models.card`).
 
     Parameters
     ----------
@@ -169,14 +67,17 @@ class Model:
     parameters : tuple of str
         The sampled parameters, in the order of `theta`.
     predict : callable, optional
-        ``(theta (k, d), conditions) -> (k, n)``: the output in its canonical unit, from parameters
-        and conditions of shape (n,) each; NaN where the equation has no value.
+        ``(theta (k, d), conditions) -> (k, n)``: the output in its canonical unit; NaN where the
+        equation has no value. Conditions are of shape (n,), or (k, n) where each vector has its
+        own; a function that does not broadcast these is called vector by vector.
     reported : mapping of str to str
         The published parameters and their units; the sampled ones by default, without units.
+    meanings : mapping of str to str
+        What sampled and published parameters are, in words.
     response : {"identity", "log"}
         Scale on which the noise is additive.
     latex : tuple of str
-        The equation, in the mathematics of `calib.models.latex`, and where it helps its parts.
+        The equation, as words with mathematics between dollars, and where it helps its parts.
     letters : str
         What its letters mean that are not parameters, with marks of `calib.report.markup`.
     applies : str
@@ -197,22 +98,21 @@ class Model:
     parabolic_in : str
         A condition in which its coefficients are parabolas, not to be trusted beyond the data.
     alone : Alone, optional
-    searched : Searched, optional
+        A simpler model, for point estimates at each value of a condition beside the joint ones.
+    searched : mapping of str to (float, float)
+        Published parameters that population methods search, in the place of the sampled ones in
+        the same places, and their bounds: multiples of the largest output if in its unit.
     estimates_all_rows : bool
         Whether point estimates are from all rows, those held out among them, as published.
     mean_response : callable, optional
-        In the place of `predict`, on the scale of the response: ``(columns, rows, references) ->
-        (k, n)``, from a column (k, 1) of each parameter and rows of shape (n,) or (k, n); NaN
-        where the equation has no value.
-    report_theta : callable
-        ``(theta, references) -> {name: (k,)}``: published parameters from sampled ones.
-    theta_from_reported : callable
-        The inverse for one vector.
+        In the place of `predict`, on the scale of the response: ``(conditions, **parameters) ->
+        (k, n)``, conditions as above with the references among them, parameters (k, 1) by name.
+    to_reported : callable
+        ``(references, **sampled) -> published``: published parameters by name from sampled ones.
+    from_reported : callable
+        The inverse, ``(references, **published) -> sampled``.
     bind_references : callable
         ``conditions -> references``.
-    prepare : callable
-        ``(conditions, references) -> rows``: what `mean_response` needs of the conditions, worked
-        out once for any number of parameter vectors.
     joined : (str, str, str), optional
         Two parameters and a condition that multiplies the second: where it varies little, the data
         determine only their sum, which is sampled together with their ratio.
@@ -231,6 +131,7 @@ class Model:
     parameters: tuple[str, ...]
     predict: Callable[[Array, Conditions], Array] | None = None
     reported: Mapping[str, str] = field(default_factory=dict)
+    meanings: Mapping[str, str] = field(default_factory=dict)
     response: Literal["identity", "log"] = "identity"
     latex: tuple[str, ...] = ()
     letters: str = ""
@@ -243,29 +144,27 @@ class Model:
     priors: str = ""
     parabolic_in: str = ""
     alone: Alone | None = None
-    searched: Searched | None = None
+    searched: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     estimates_all_rows: bool = False
-    mean_response: Callable[[Columns, Rows, References], Array] = not_given
-    report_theta: Callable[[Array, References], dict[str, Array]] = not_given
-    theta_from_reported: Callable[[Mapping[str, float], References], Array] = not_given
-    bind_references: Callable[[Conditions], dict[str, float]] = _no_references
-    prepare: Callable[[Conditions, References], Rows] = _as_they_are
+    mean_response: Callable[..., Array] | None = None
+    to_reported: Callable[..., Parameters] = as_they_are
+    from_reported: Callable[..., Parameters] = as_they_are
+    bind_references: Callable[[Conditions], dict[str, float]] = no_references
     joined: tuple[str, str, str] | None = None
     slow: bool = False
     uncertain: Callable[[Array, Conditions], tuple[Array, Array, Array]] | None = None
+    # Whether `predict` takes conditions of each vector's own; None until it was tried.
+    _broadcasts: bool | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not self.reported:
             object.__setattr__(self, "reported", dict.fromkeys(self.parameters, "1"))
-        if self.mean_response is not_given:
-            object.__setattr__(self, "mean_response", _Predicted(self))
-        if self.report_theta is not_given:
-            object.__setattr__(self, "report_theta", partial(_by_name, self.parameters))
-            object.__setattr__(self, "theta_from_reported", partial(_vector, self.parameters))
 
     @property
     def equation(self) -> str:
         """The equation as plain text, with its number in the source."""
+        from calib.models.card import text
+
         written = ", ".join(text(part) for part in self.latex)
         return f"{written}  ({self.numbers})" if self.numbers else written
 
@@ -280,7 +179,7 @@ class Model:
 
         if MODELS.get(self.name) is self:
             return get_model, (self.name,)
-        return partial(Model, **{f.name: getattr(self, f.name) for f in fields(self)}), ()
+        return partial(Model, **{f.name: getattr(self, f.name) for f in fields(self) if f.init}), ()
 
     def register(self) -> None:
         """Make it known by its name; a CalibError if the declaration does not hold together."""
@@ -312,31 +211,32 @@ class BoundModel:
     model: Model
     references: References
 
-    def mean_response(
-        self, theta: Array, conditions: Conditions, rows: Rows | None = None
-    ) -> Array:
-        """Predict on the scale of the response, shape (k, n); rows if prepared before."""
-        with np.errstate(all="ignore"):
-            theta = np.atleast_2d(theta)
-            k = max([len(theta)] + [len(v) for v in conditions.values() if v.ndim > 1])
-            if self.model.slow and k > 1:
-                # Finite differences repeat many vectors.
-                own = {name: v for name, v in conditions.items() if v.ndim > 1}
-                each = [np.broadcast_to(v, (k, v.shape[1])) for v in (theta, *own.values())]
-                _, first, again = np.unique(
-                    np.concatenate(each, axis=1), axis=0, return_index=True, return_inverse=True
-                )
-                if first.size < k:
-                    theta, *rest = (v[first] for v in each)
-                    conditions = {**conditions, **dict(zip(own, rest, strict=True))}
-                    return self.mean_response(theta, conditions, None if own else rows)[again]
-            rows = self.model.prepare(conditions, self.references) if rows is None else rows
-            return self.model.mean_response(columns(theta), rows, self.references)
+    def mean_response(self, theta: Array, conditions: Conditions) -> Array:
+        """Predict on the scale of the response, shape (k, n).
 
-    def prepare(self, conditions: Conditions) -> Rows:
-        """Work out what the equation needs of conditions."""
+        Parameters are of shape (k, d), conditions of shape (n,) or, of each vector's own, (k, n).
+        """
+        theta = np.atleast_2d(theta)
+        own = {name: v for name, v in conditions.items() if v.ndim > 1}
+        k = max([len(theta), *map(len, own.values())])
+        if self.model.slow and k > 1:
+            # Finite differences repeat many vectors.
+            each = [np.broadcast_to(v, (k, v.shape[1])) for v in (theta, *own.values())]
+            _, first, again = np.unique(
+                np.concatenate(each, axis=1), axis=0, return_index=True, return_inverse=True
+            )
+            theta, *rest = (v[first] for v in each)
+            conditions = {**conditions, **dict(zip(own, rest, strict=True))}
+            return self._evaluate(theta, conditions)[again]
+        return self._evaluate(theta, conditions)
+
+    def _evaluate(self, theta: Array, conditions: Conditions) -> Array:
         with np.errstate(all="ignore"):
-            return self.model.prepare(conditions, self.references)
+            if self.model.mean_response is None:
+                return _predicted(self.model, theta, conditions)
+            named = dict(zip(self.model.parameters, theta.T[:, :, None], strict=True))
+            at = {**conditions, **self.references}
+            return np.asarray(self.model.mean_response(at, **named))
 
     def predict(self, theta: Array, conditions: Conditions) -> Array:
         """Predict the output in its canonical unit, shape (k, n)."""
@@ -353,48 +253,117 @@ class BoundModel:
 
     def report(self, theta: Array) -> dict[str, Array]:
         """Return the published parameters of each vector, each of shape (k,)."""
+        named = dict(zip(self.model.parameters, np.atleast_2d(theta).T, strict=True))
         # Published coefficients may overflow where the sampled ones do not.
         with np.errstate(all="ignore"):
-            return self.model.report_theta(np.atleast_2d(theta), self.references)
+            found = self.model.to_reported(self.references, **named)
+        return {name: found[name] for name in self.model.reported}
 
-    def theta(self, reported: Mapping[str, float]) -> Array:
-        """Return the sampled parameters of published ones, shape (d,)."""
-        return self.model.theta_from_reported(reported, self.references)
+    def theta(self, reported: Parameters) -> Array:
+        """Return the sampled parameters of published ones, (d,), or (k, d) of arrays (k,)."""
+        published = {p: v for p, v in reported.items() if p in self.model.reported}
+        found = self.model.from_reported(self.references, **published)
+        columns = [np.asarray(found[p], dtype=np.float64) for p in self.model.parameters]
+        return np.stack(np.broadcast_arrays(*columns), axis=-1)
 
 
-_ONE = "dimensionless"
+def _predicted(model: Model, theta: Array, conditions: Conditions) -> Array:
+    """Return the mean response by `predict`, (k, n)."""
+    shape = np.broadcast_shapes(*(v.shape for v in conditions.values()))
+    if len(shape) == 1:
+        return _called(model, theta, conditions)
+    k = max(len(theta), shape[0])
+    theta = np.broadcast_to(theta, (k, theta.shape[1]))
+    own = {name: np.broadcast_to(v, (k, shape[1])) for name, v in conditions.items()}
+    if k > 1 and _broadcasts(model, theta[:2], {name: v[:2] for name, v in own.items()}):
+        return _called(model, theta, own)
+    return _each(model, theta, own)
+
+
+def _each(model: Model, theta: Array, own: Conditions) -> Array:
+    """Evaluate vector by vector, conditions (k, n) of each vector's own."""
+    rows = [{name: v[i] for name, v in own.items()} for i in range(len(theta))]
+    return np.concatenate([_called(model, theta[i : i + 1], at) for i, at in enumerate(rows)])
+
+
+def _broadcasts(model: Model, theta: Array, own: Conditions) -> bool:
+    """Whether `predict` gives two vectors with conditions of their own what it gives each."""
+    known = getattr(model.predict, "broadcasts", model._broadcasts)
+    if known is None:
+        try:
+            together = _called(model, theta, own)
+            known = np.allclose(together, _each(model, theta, own), 1e-12, 0.0, equal_nan=True)
+        except CalibError:
+            known = False
+        object.__setattr__(model, "_broadcasts", bool(known))
+    return bool(known)
+
+
+def _called(model: Model, theta: Array, conditions: Conditions) -> Array:
+    """Call `predict` and check what it returns; a CalibError names the line that fails."""
+    if model.predict is None:
+        raise CalibError(
+            f"the model {model.name} has no predict",
+            expected="predict(theta (k, d), conditions) -> (k, n)",
+            hint="declare it with a function that predicts its output",
+        )
+    # Copies, as a function may change its arguments.
+    handed = theta.copy(), {name: v.copy() for name, v in conditions.items()}
+    try:
+        given = call(model.predict, *handed)
+    except CalibError:
+        raise
+    except (Exception, SystemExit) as error:  # of the user's own code
+        frame = traceback.extract_tb(error.__traceback__)[-1]
+        raise CalibError(
+            f"predict of the model {model.name} fails: {type(error).__name__}: {error}",
+            where=f"{frame.filename}, line {frame.lineno}",
+            expected=f"conditions {', '.join(model.conditions)}; parameters in columns of "
+            f"theta (k, {len(model.parameters)})",
+            hint="correct the function",
+        ) from error
+    try:
+        found = real_array(given, QUANTITIES[model.output].unit)
+    except CalibError as error:
+        raise error.within(f"predict of the model {model.name}") from None
+    n = next(iter(conditions.values())).shape[-1]
+    if found.shape != (theta.shape[0], n):
+        raise CalibError(
+            f"predict of the model {model.name} returned the shape {found.shape}",
+            expected=f"(vectors, rows) = ({theta.shape[0]}, {n})",
+            hint="theta[:, :1] is the first parameter as a column, (vectors, 1)",
+        )
+    return np.log(found) if model.response == "log" else found
+
+
 # Dimensions of the variables in `calib.inference.io`.
 DIMENSIONS = dict.fromkeys(("chain", "draw", "row"), "a dimension of the files of draws")
 
 
 def check_tuple(attribute: str, given: object, where: str) -> None:
     """Refuse plain text in the place of a tuple of texts: it would be taken letter by letter."""
+    if isinstance(given, list | tuple) and all(isinstance(part, str) for part in given):
+        return
+    hint = 'write each between quotation marks, with commas: ("a", "b")'
     if isinstance(given, str):
-        raise CalibError(
-            f"{attribute} is the text {given!r}", where=where, expected="a tuple of texts",
-            hint=f"write {attribute} = ({_quoted(given)},), with the comma",
-        )  # fmt: skip
-    if not isinstance(given, list | tuple) or not all(isinstance(part, str) for part in given):
-        raise CalibError(
-            f"{attribute} is {given!r}", where=where, expected="a tuple of texts",
-            hint='write each between quotation marks, with commas: ("a", "b")',
-        )  # fmt: skip
-
-
-def _quoted(given: str) -> str:
-    """Return a text as a Python literal."""
-    return f'r"{given}"' if "\\" in given else f'"{given}"'
+        literal = f'r"{given}"' if "\\" in given else f'"{given}"'
+        hint = f"write {attribute} = ({literal},), with the comma"
+    what = "the text " * isinstance(given, str)
+    raise CalibError(
+        f"{attribute} is {what}{given!r}", where=where, expected="a tuple of texts", hint=hint
+    )
 
 
 def check_word(name: object, what: str, where: str) -> None:
     """Check that the name of a model or a parameter is an identifier."""
     if not isinstance(name, str) or not name.isidentifier():
         raise CalibError(
-            f"{name!r} is no name for a {what}", where=where,
+            f"{name!r} is no name for a {what}",
+            where=where,
             expected="letters of any script, digits and underscores, not beginning with a digit: "
             "it names columns, variables of netCDF and marks of templates too",
             hint="give it another name",
-        )  # fmt: skip
+        )
 
 
 def check_names(
@@ -408,90 +377,93 @@ def check_names(
     # Letters with two encodings are the same.
     known = {normalize("NFKC", name): what for name, what in taken.items()}
     for name, what, key in given:
-        other = known.get(normalize("NFKC", name))
-        if other is not None:
+        other = known.setdefault(normalize("NFKC", name), "")
+        if other:
             raise CalibError(
                 f"{what} is there twice" if other == what else f"{what} has the name of {other}",
-                where=f"{where}, {key}",
+                where=", ".join(filter(None, (where, key))),
                 expected="a name for each parameter, condition and output that nothing else has: "
                 f"not {', '.join(taken)}",
                 hint="rename one of them",
-            )  # fmt: skip
+            )
         known[normalize("NFKC", name)] = what
 
 
 def check_model(model: Model) -> None:
     """Check a declaration: columns, names, priors and their units; the error says what is off."""
-    where = f"model {model.name!r}"
-    check_word(model.name, "model", where)
-    for parameter in model.parameters if not isinstance(model.parameters, str) else ():
-        check_word(parameter, "parameter", where)
-    for attribute in ("conditions", "parameters", "latex"):
-        check_tuple(attribute, getattr(model, attribute), where)
+    try:
+        _check_names_of(model)
+        _check_priors(model)
+    except CalibError as error:
+        raise error.within(f"model {model.name!r}") from None
+
+
+def _check_names_of(model: Model) -> None:
+    check_word(model.name, "model", "")
+    for attribute in ("parameters", "conditions", "latex"):
+        check_tuple(attribute, getattr(model, attribute), "")
+    for parameter in model.parameters:
+        check_word(parameter, "parameter", "")
     for column in (model.output, *model.conditions):
         if column not in QUANTITIES:
-            raise CalibError(
-                f"there is no quantity {column!r}", where=where, expected=", ".join(QUANTITIES),
-                hint="register a Quantity for it before the model",
-            )  # fmt: skip
+            hint = "register a Quantity for it before the model"
+            known = ", ".join(QUANTITIES)
+            raise CalibError(f"there is no quantity {column!r}", expected=known, hint=hint)
     if QUANTITIES[model.output].role != "output":
         raise CalibError(
-            f"{model.output} is no output", where=where, expected=", ".join(OUTPUTS.values()),
+            f"{model.output} is no output",
+            expected=", ".join(OUTPUTS.values()),
             hint='register its Quantity with role="output"',
-        )  # fmt: skip
+        )
     if not model.conditions or not model.parameters:
-        raise CalibError(
-            "a model needs conditions and parameters", where=where,
-            hint="name at least one of each",
-        )  # fmt: skip
-    names = (*model.parameters, "sigma")
+        raise CalibError("a model needs conditions and parameters", hint="name one of each")
     derived = [name for name in model.reported if name not in model.parameters]
     given = [(name, f"the parameter {name}", "parameters") for name in model.parameters]
     given += [(name, f"the published parameter {name}", "reported") for name in derived]
     given += [(name, f"the condition {name}", "conditions") for name in model.conditions]
     given += [(model.output, f"the output {model.output}", "output")]
-    check_names(DIMENSIONS | {"sigma": "the noise"}, given, where)
+    check_names(DIMENSIONS | {"sigma": "the noise"}, given, "")
+
+
+def _check_priors(model: Model) -> None:
+    """Check that each parameter has a prior, in its unit as far as that is known."""
     if not model.priors:
         raise CalibError(
-            "the model has no priors", where=where,
+            "the model has no priors",
             expected="priors=... with the text of a prior file",
             hint="write it after the example that `calib priors magic_formula` shows",
-        )  # fmt: skip
+        )
     try:
         given = tomllib.loads(model.priors).get("parameters", {})
     except tomllib.TOMLDecodeError as error:
-        raise CalibError(
-            f"its priors are not valid TOML: {error}", where=where, hint=MEND_TOML
-        ) from None
+        raise CalibError(f"its priors are not valid TOML: {error}", hint=MEND_TOML) from None
+    names = (*model.parameters, "sigma")
     apart = sorted(set(names) ^ set(given))
     if apart:
         raise CalibError(
-            f"its priors and its parameters differ by {', '.join(apart)}", where=where,
-            expected=", ".join(names), hint="give a prior for each of these, and for nothing else",
-        )  # fmt: skip
-    _check_units(model, given, where)
-
-
-def _check_units(model: Model, given: dict[str, Any], where: str) -> None:
-    """Refuse a prior in another unit than its parameter's, as far as that is known."""
-    log = model.response == "log"
-    wanted = {"sigma": "1" if log else QUANTITIES[model.output].unit}
+            f"its priors and its parameters differ by {', '.join(apart)}",
+            expected=", ".join(names),
+            hint="give a prior for each of these, and for nothing else",
+        )
+    wanted = {"sigma": "1" if model.response == "log" else QUANTITIES[model.output].unit}
     # Without `reported` all have the unit 1, which says nothing.
     if set(model.reported.values()) != {"1"}:
         wanted |= {name: unit for name, unit in model.reported.items() if name in model.parameters}
     for name, unit in wanted.items():
         found = given[name].get("unit") if isinstance(given[name], dict) else None
         if found is not None and not _same_unit(str(found), unit):
+            unit = unit.replace("**", "^").replace("dimensionless", "1")
             raise CalibError(
-                f"the unit is {found!r}", where=f"{where}, priors, parameters.{name}.unit",
-                expected=f'unit = "{unit.replace("**", "^").replace(_ONE, "1")}"',
+                f"the unit is {found!r}",
+                where=f"priors, parameters.{name}.unit",
+                expected=f'unit = "{unit}"',
                 hint="convert the numbers to this unit",
-            )  # fmt: skip
+            )
 
 
 def _same_unit(found: str, wanted: str) -> bool:
-    found, wanted = (_ONE if u == "1" else u.replace("^", "**") for u in (found, wanted))
+    pair = [("dimensionless" if u == "1" else u).replace("^", "**") for u in (found, wanted)]
     try:
-        return found == wanted or float(convert(1.0, found, wanted)) == 1.0
+        return pair[0] == pair[1] or float(convert(1.0, *pair)) == 1.0
     except CalibError:
         return False

@@ -24,7 +24,7 @@ from calib.inference.prior_files import default_priors, read_priors
 from calib.inference.priors import Prior
 from calib.models import MODELS, Model
 from calib.models.base import Array
-from calib.models.latex import text
+from calib.models.card import text
 from calib.report.numbers import NOTHING, format_number
 
 NO_UNIT = NOTHING
@@ -309,6 +309,7 @@ def model_facts(model: Model) -> Facts:
         "columns": {c: _unit_and_range(QUANTITIES[c]) for c in (model.output, *model.conditions)},
         "noise": NOISE[model.response],
         "parameters": list(model.parameters),
+        "meanings": dict(model.meanings),
         "priors": _priors(model_priors(model)),
     }
 

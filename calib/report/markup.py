@@ -22,7 +22,7 @@ from markupsafe import Markup
 from markupsafe import escape as html_escape
 
 from calib.models import get_model
-from calib.models.latex import html, text
+from calib.models.card import mathml, text
 from calib.report.labels import (
     degrees,
     plain,
@@ -238,7 +238,7 @@ def to_html(sentence: str) -> Markup:
     return Markup(
         _written(
             sentence, lambda part: str(html_escape(part)),
-            (lambda mark: str(html_escape(_cite(mark))), symbol_html, unit_html, _equations(html),
+            (lambda mark: str(html_escape(_cite(mark))), symbol_html, unit_html, _equations(mathml),
              lambda strong: f"<strong>{html_escape(strong)}</strong>",
              lambda code: f"<code>{html_escape(code)}</code>"),
         )

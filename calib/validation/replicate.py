@@ -30,10 +30,10 @@ from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
 from calib.inference.sampler import Draws, SamplerSettings
 from calib.models import Model, example_csv, get_model
-from calib.models.base import Array, Conditions, not_given
-from calib.models.simulators.registered import Simulated as SlowSimulator
-from calib.models.simulators.registered import slow_simulator
-from calib.models.simulators.runs import RunKeeper
+from calib.models.base import Array, Conditions
+from calib.models.simulators.declaration import Simulated as SlowSimulator
+from calib.models.simulators.declaration import slow_simulator
+from calib.models.simulators.simulator import RunKeeper
 from calib.validation.prediction import predict
 from calib.validation.scores import LEVELS
 
@@ -229,7 +229,7 @@ def run_each(
     keeper = RunKeeper(found.simulator, found.folder, workers, scheduler)
     model = template.bound.model
     # What is evaluated follows from the equation.
-    asking = replace(model, predict=_Runs(keeper, model.output), mean_response=not_given)
+    asking = replace(model, predict=_Runs(keeper, model.output), mean_response=None)
     return replace(template, bound=replace(template.bound, model=asking))
 
 
@@ -249,7 +249,7 @@ def most_runs(model: str, found: SlowSimulator, design: Design, simulations: int
     CalibError
         If it cannot be run: a table of runs has none at a new truth.
     """
-    if not found.simulator.way.runs:
+    if not found.simulator.runner.runs:
         raise CalibError(
             f"{model} is a table of runs already made: there is none at the truths that are drawn",
             where=f"simulator {found.name}", expected="a simulator that can be run",

@@ -39,7 +39,7 @@ from calib.inference.random import generator
 from calib.inference.sampler import SamplerSettings
 from calib.models import MODELS, get_model
 from calib.models.base import Array
-from calib.models.simulators.registered import slow_simulator
+from calib.models.simulators.declaration import slow_simulator
 from calib.validation.replicate import Item, design_of, most_runs, replicate
 from calib.validation.scores import LEVELS
 

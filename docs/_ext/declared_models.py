@@ -87,6 +87,9 @@ def _parameters(model: Model) -> list[str]:
         "is a part of that column's median, 5 where the data lack it. Print the file with "
         f"`calib priors {model.name}`, edit a copy, and pass it with `--priors`.\n",
     ]
+    if model.meanings:
+        rows = ((code(name), words(said)) for name, said in model.meanings.items())
+        found += ["## Meanings of the parameters\n", table(("parameter", "meaning"), rows)]
     if not model.by_sampled:
         rows = ((code(name), unit(u)) for name, u in model.reported.items())
         found += ["## Reported parameters\n", table(("parameter", "unit"), rows)]

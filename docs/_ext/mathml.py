@@ -2,30 +2,20 @@
 
 from __future__ import annotations
 
-import re
 from typing import Any
 
 from docutils import nodes
-from docutils.utils.math.latex2mathml import tex2mathml
 
-_FUNCTION = r"\\(?:sin|cos|tan|arctan|exp|ln|log|max|min)\b"
-
-
-def _spaced(latex: str) -> str:
-    """Set functions off from the letters beside them, which browsers do not."""
-    latex = re.sub(rf"(?<=[\w)\]}}])\s*(?={_FUNCTION})", r"\\,", latex)
-    return re.sub(rf"({_FUNCTION})\s+(?=[A-Za-z\\])", r"\1\\,", latex)
+from calib.models.card import formula
 
 
 def _inline(self: Any, node: nodes.math) -> None:
-    self.body.append(tex2mathml(_spaced(node.astext()), as_block=False))
+    self.body.append(formula(node.astext()))
     raise nodes.SkipNode
 
 
 def _block(self: Any, node: nodes.math_block) -> None:
-    self.body.append(
-        f'<div class="equation">{tex2mathml(_spaced(node.astext()), as_block=True)}</div>'
-    )
+    self.body.append(f'<div class="equation">{formula(node.astext(), "block")}</div>')
     raise nodes.SkipNode
 
 

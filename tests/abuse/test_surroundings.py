@@ -36,12 +36,15 @@ from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
 from calib.inference.prior_files import default_priors, read_priors
 from calib.models import MODELS, example_csv
-from calib.models.simulators.base import Failure, Output, Simulator
-from calib.models.simulators.files import read_simulator, register_file
-from calib.models.simulators.process import run_program
-from calib.models.simulators.registered import SIMULATED
-from calib.models.simulators.runs import RunKeeper
-from calib.models.simulators.ways import CallableWay, CommandWay, UmbridgeWay, output_of_text
+from calib.models.simulators.declaration import SIMULATED, read_simulator, register_file
+from calib.models.simulators.runner import (
+    CallableRunner,
+    CommandRunner,
+    UmbridgeRunner,
+    output_of_text,
+    run_program,
+)
+from calib.models.simulators.simulator import Failure, Output, RunKeeper, Simulator
 from tests.abuse.test_writing import mounted
 from tests.gap.cases import PULL_ONLY, make_case, write_case
 from tests.models.simulators.examples import PRIORS, lab, write_program
@@ -280,7 +283,7 @@ def out_of_memory(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
 
 def in_python(function: Callable[..., Any], limit: float | None = None, **more: Any) -> Simulator:
     return Simulator(
-        "wheel", CallableWay(function, ("pull",), limit=limit), ("mu", "s0"), PRIORS,
+        "wheel", CallableRunner(function, ("pull",), limit=limit), ("mu", "s0"), PRIORS,
         {"s": "slip_percent", "w": "normal_load_kn"}, (Output("drawbar_pull_n", "pull", ""),),
         **more,
     )  # fmt: skip
@@ -367,7 +370,7 @@ def serving(port: int, code: int = 200) -> Iterator[None]:
 
 def remote(url: str) -> Simulator:
     return Simulator(
-        "wheel", UmbridgeWay(url, "forward", ("pull",), limit=5.0), ("mu", "s0"), PRIORS,
+        "wheel", UmbridgeRunner(url, "forward", ("pull",), limit=5.0), ("mu", "s0"), PRIORS,
         {"s": "slip_percent", "w": "normal_load_kn"}, (Output("drawbar_pull_n", "pull", ""),),
     )  # fmt: skip
 
@@ -572,7 +575,7 @@ def test_a_program_is_run_by_the_path_that_names_it(tmp_path: Path) -> None:
     )
     (tmp_path / "real").chmod(0o755)
     (tmp_path / "linked").symlink_to("real")
-    way = CommandWay(("./linked",), tmp_path)
+    way = CommandRunner(("./linked",), tmp_path)
     found = way.run({"mu": 1.0}, {"w": np.ones(2)})
     assert not isinstance(found, Failure), found
     assert (tmp_path / "ran").read_text().strip() == str(tmp_path / "linked")
@@ -594,7 +597,7 @@ def test_a_script_that_is_none_here_is_told_why(
     (tmp_path / "run").write_bytes(script.encode())
     (tmp_path / "run").chmod(0o755)
     with pytest.raises(CalibError) as caught:
-        CommandWay(tuple(arguments), tmp_path).run({"mu": 1.0}, {"w": np.ones(2)})
+        CommandRunner(tuple(arguments), tmp_path).run({"mu": 1.0}, {"w": np.ones(2)})
     assert word in str(caught.value)
 
 
@@ -603,7 +606,7 @@ def test_a_program_that_starts_another_is_told_where_it_runs(tmp_path: Path) -> 
     (tmp_path / "other").write_text("#!/bin/sh\necho '{\"pull\": [1, 2]}'\n")
     for name in ("run", "other"):
         (tmp_path / name).chmod(0o755)
-    way = CommandWay(("./run",), tmp_path)
+    way = CommandRunner(("./run",), tmp_path)
     with pytest.raises(CalibError, match=r"runs in \S*calib-run-\w+, .* CALIB_SIMULATOR"):
         way.run({"mu": 1.0}, {"w": np.ones(2)})
     (tmp_path / "run").write_text("#!/bin/sh\n$CALIB_SIMULATOR/other\n")
@@ -637,8 +640,8 @@ def test_texts_are_read_however_they_were_saved(how: str, tmp_path: Path) -> Non
     file = write_program(tmp_path, input='"template"', template='"in.txt"')
     file.write_bytes(write(file.read_text()))
     Path("in.txt").write_bytes(write("@mu@ @s0@ @s@ @w@\n"))
-    way = read_simulator(file).simulator.way
-    assert isinstance(way, CommandWay)
+    way = read_simulator(file).simulator.runner
+    assert isinstance(way, CommandRunner)
     assert way.template == "@mu@ @s0@ @s@ @w@\n"
     write_case(make_case("force_offset", models=PULL_ONLY, n_lab=15, n_field=12), Path("case"))
     for path in Path("case").glob("*.*"):
@@ -655,7 +658,7 @@ def test_of_a_program_too(how: str, printed: bool, tmp_path: Path) -> None:
     content = WRITTEN[how]("pull,n\n1,1\n2,2\n")
     to = "sys.stdout.buffer" if printed else "open(sys.argv[1], 'wb')"
     arguments = [sys.executable, "-c", f"import sys; {to}.write({content!r})"]
-    way = CommandWay((*arguments, *([] if printed else ["{output}"])), tmp_path, gives="csv")
+    way = CommandRunner((*arguments, *([] if printed else ["{output}"])), tmp_path, gives="csv")
     found = way.run({"mu": 1.0}, {"w": np.ones(2)})
     assert not isinstance(found, Failure), found
     assert found["pull"].tolist() == [1.0, 2.0]

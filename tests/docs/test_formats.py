@@ -20,7 +20,7 @@ from calib.data.quantities import QUANTITIES
 from calib.gap.effects import View
 from calib.inference.io import RunRecord
 from calib.models import example_csv
-from calib.models.simulators.files import SimulatorFile
+from calib.models.simulators.declaration import SimulatorFile
 from tests.cli.test_cli import Calib
 from tests.docs.pages import DOCS
 from tests.main_report import main_report

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.cli.test_cli import Calib, Ran
-from tests.docs.pages import PAGES, ROOT, Block, blocks
+from tests.docs.pages import PAGES, Block, blocks
 
 BLOCKS = {page: list(blocks(path.read_text(encoding="utf-8"))) for page, path in PAGES.items()}
 RUN = ("console", "python")
@@ -86,13 +86,6 @@ def test_a_page_does_what_it_says(page: str, run: Calib) -> None:
 @pytest.mark.parametrize("page", [p for p, found in BLOCKS.items() if any(b.slow for b in found)])
 def test_a_page_does_what_it_says_to_the_end(page: str, run: Calib) -> None:
     follow(page, run, slow=True)
-
-
-def test_files_of_a_users_own_are_on_the_page_as_they_are_tested() -> None:
-    """Where the sources of the pages are read, nothing would be included."""
-    shown = {b.caption: b.text for b in BLOCKS["docs/extend.md"] if b.caption}
-    for name in ("wheel_torque.py", "load_sensitivity.py"):
-        assert shown[name] == (ROOT / "tests" / "extension" / name).read_text(encoding="utf-8")
 
 
 PAGE = """\

@@ -24,7 +24,6 @@ from tests.cli.test_cli import Calib
 from tests.docs.pages import ROOT, blocks
 from tests.registered import forgotten
 
-HERE = Path(__file__).parent
 FEW = ["--max-steps", 400]
 
 
@@ -35,6 +34,14 @@ def as_before() -> Iterator[None]:
         yield
     for name in [m for m in sys.modules if m.startswith("calib_user_")]:
         del sys.modules[name]
+
+
+def own(name: str) -> Path:
+    """Write a file of one's own, as the documentation prints it."""
+    page = (ROOT / "docs" / "extend.md").read_text(encoding="utf-8")
+    text = next(block.text for block in blocks(page) if block.caption == name)
+    Path(name).write_text(text, encoding="utf-8")
+    return Path(name).resolve()
 
 
 def field_of(example: str, rng: np.random.Generator) -> str:
@@ -52,19 +59,19 @@ def field_of(example: str, rng: np.random.Generator) -> str:
 
 
 def test_a_new_output_its_model_and_its_effect_go_through_every_verb(run: Calib) -> None:
-    own = ["--models", HERE / "wheel_torque.py"]
-    assert "janosi_torque: Wheel torque" in run("models", *own).out
-    assert 'model = "janosi_torque"' in run("priors", "janosi_torque", *own).out
-    example = run("template", "janosi_torque", *own).out
+    mine = ["--models", own("wheel_torque.py")]
+    assert "janosi_torque: Wheel torque" in run("models", *mine).out
+    assert 'model = "janosi_torque"' in run("priors", "janosi_torque", *mine).out
+    example = run("template", "janosi_torque", *mine).out
     Path("torque.csv").write_text(example)
-    fitted = run("fit", "torque.csv", "--model", "janosi_torque", *own, "--out", "run", *FEW,
+    fitted = run("fit", "torque.csv", "--model", "janosi_torque", *mine, "--out", "run", *FEW,
                  "--hold-out", "normal_load_kn=4")  # fmt: skip
     assert fitted.code == 0, fitted.err
-    predicted = run("predict", "run", "--at", "torque.csv", *own, "--out", "bands.csv")
+    predicted = run("predict", "run", "--at", "torque.csv", *mine, "--out", "bands.csv")
     assert "18 rows written" in predicted.out
     assert "wheel_torque_knm_predictive_90_lower" in Path("bands.csv").read_text()
     # A report chooses the model by the columns, as for any output.
-    made = run("report", "torque.csv", *own, "--out", "report", "--workers", 1, *FEW)
+    made = run("report", "torque.csv", *mine, "--out", "report", "--workers", 1, *FEW)
     assert made.code == 0, made.err
     assert "wheel_torque: converged" in made.out
     summary = json.loads(Path("report/summary.json").read_text())
@@ -75,40 +82,17 @@ def test_a_new_output_its_model_and_its_effect_go_through_every_verb(run: Calib)
     page = Path("report/index.html").read_text()
     assert "could not be drawn" not in page
     assert "Wheel torque" in page
-    checked = run("check", "report", *own, "--workers", 1)
+    checked = run("check", "report", *mine, "--workers", 1)
     assert checked.code == 0, checked.out
     assert checked.out.startswith("SAME")
     # Without the file nobody knows the model; the message says how to name it.
+    assert "--models FILE" in run("template", "my_pull").err
     Path("field.csv").write_text(field_of(example, np.random.default_rng(1)))
-    found = run("diagnose", "--run", "run", "--field", "field.csv", *own, "--out", "gap",
+    found = run("diagnose", "--run", "run", "--field", "field.csv", *mine, "--out", "gap",
                 "--workers", 1)  # fmt: skip
     assert found.code == 0, found.err
     assert found.out.startswith("verdict: effect (The gearbox takes more torque")
     assert "could not be drawn" not in Path("gap/index.html").read_text()
-
-
-def test_without_its_file_a_model_is_unknown(
-    run: Calib,
-) -> None:
-    refused = run("template", "one_tyre")
-    assert refused.code == 2
-    assert "--models FILE" in refused.err
-
-
-@pytest.mark.slow
-def test_a_traction_model_of_ones_own_is_simulated_and_reported(run: Calib) -> None:
-    own = ["--models", HERE / "one_tyre.py"]
-    Path("pull.csv").write_text(run("template", "one_tyre", *own).out)
-    proved = run("sbc", "--model", "one_tyre", *own, "--simulations", 10, "--out", "sbc",
-                 "--workers", 1)  # fmt: skip
-    assert proved.code in (0, 1), proved.err
-    assert "one_tyre  10" in proved.out
-    made = run("report", "pull.csv", *own, "--out", "report", "--workers", 1, *FEW)
-    assert made.code == 0, made.err
-    # It makes use of more of the columns than the Magic Formula.
-    summary = json.loads(Path("report/summary.json").read_text())
-    assert summary["models"]["drawbar_pull"]["model"] == "one_tyre"
-    assert "Wismer &amp; Luth" in Path("report/index.html").read_text()
 
 
 def test_a_condition_that_the_simulator_ignores_is_named_as_the_cause(run: Calib) -> None:
@@ -129,8 +113,8 @@ def test_a_condition_that_the_simulator_ignores_is_named_as_the_cause(run: Calib
         'calibration = "lab.csv"\nfield = "field.csv"\npredict = "fresh.csv"\n'
         '[models]\ndrawbar_pull = "magic_formula"\n'
     )
-    own = ["--models", HERE / "load_sensitivity.py"]
-    found = run("diagnose", "case", *own, "--out", "gap", "--workers", 1)
+    mine = ["--models", own("load_sensitivity.py")]
+    found = run("diagnose", "case", *mine, "--out", "gap", "--workers", 1)
     assert found.code == 0, found.err
     assert "load_sensitivity" in found.out.splitlines()[1]
 
@@ -261,55 +245,26 @@ def test_a_file_that_does_not_run_is_named_with_its_line(run: Calib) -> None:
 
 def test_equations_are_read_from_their_latex() -> None:
     model = declared(latex=(r"$\frac{a}{b} \sqrt{x_1} - \mathrm{CI}^{2n}$",), numbers="Eq 3")
-    assert model.equation == "(a)/(b) \u221a(x_1) - CI^(2n)  (Eq 3)"
-    assert "<i>x</i><sub>1</sub>" in equation(BoundModel(model, {}))
+    assert model.equation == "(a)/(b) \u221a(x_1) - CI^(2 n)  (Eq 3)"
+    assert "<msub><mi>x</mi><mn>1</mn></msub>" in equation(BoundModel(model, {}))
 
 
-def test_the_documentations_own_model_goes_as_printed(run: Calib) -> None:
-    # On two processes, whose server was started before the model was known.
+def test_a_model_of_lambdas_is_reported_on_two_processes(run: Calib) -> None:
+    """Its functions cannot be pickled, and its server was started before the model was known."""
     with pool(2) as before:
         before.submit(len, "").result()
-    page = list(blocks((ROOT / "docs" / "extend.md").read_text(encoding="utf-8")))
-    declared = next(block for block in page if block.caption == "my_model.py")
-    Path("my_model.py").write_text(declared.text, encoding="utf-8")
-    lines = [line for b in page if b.language == "console" for line in b.text.splitlines()]
-    of_it = {line.split()[1]: line.split()[1:] for line in lines if "my_model.py" in line}
-    for verb in ("template", "report"):
-        ran = run(*of_it[verb])
-        assert ran.code == 0, ran.err
-    assert "janosi_pull" in Path("report/summary.json").read_text()
-
-
-@pytest.mark.slow
-def test_a_density_model_of_lambdas_is_reported_on_two_processes(run: Calib) -> None:
-    """Its conditions are not those of the shipped density models, and it cannot be pickled."""
-    Path("dens.py").write_text(
-        """
-import calib
-
-ROWS = zip([50, 60, 80, 100, 120, 150, 180, 220], [1.34, 1.34, 1.4, 1.41, 1.41, 1.46, 1.45, 1.49])
-NORMAL = 'dist = "normal"\\nmean = 1.0\\nsd = 1.0\\n'
-WORDS = 'unit = "g/cm^3"\\nreason = "compaction"\\nsource = "a guess"\\n'
-calib.register(calib.Model(
-    name="compaction", title="Density by ground pressure", output="bulk_density_g_cm3",
-    conditions=("average_ground_pressure_kpa",), parameters=("a", "b"),
-    predict=lambda t, c: t[:, :1] * (c["average_ground_pressure_kpa"] / 100.0) ** t[:, 1:],
-    latex=(r"$\\\\rho = a (p/p_0)^b$",), source="a guess",
-    example="average_ground_pressure_kpa,bulk_density_g_cm3\\n"
-    + "".join(f"{p},{d}\\n" for p, d in ROWS),
-    priors='model = "compaction"\\n'
-    + "".join(f"[parameters.{n}]\\n{NORMAL}{WORDS}" for n in ("a", "b"))
-    + f'[parameters.sigma]\\ndist = "half_normal"\\nsd = 0.1\\n{WORDS}',
-))
-""",
-        encoding="utf-8",
-    )
-    own = ["--models", "dens.py"]
-    Path("d.csv").write_text(run("template", "compaction", *own).out)
-    made = run("report", "d.csv", "--model", "compaction", "--only", "bulk_density", *own,
-               "--out", "report", "--workers", 2, *FEW)  # fmt: skip
+    text = own("my_model.py").read_text(encoding="utf-8")
+    named = text.replace("predict=predict", "predict=lambda theta, x: predict(theta, x)")
+    assert named != text
+    Path("my_model.py").write_text(named, encoding="utf-8")
+    mine = ["--models", "my_model.py"]
+    Path("d.csv").write_text(run("template", "janosi_pull", *mine).out)
+    made = run("report", "d.csv", "--model", "janosi_pull", *mine, "--out", "report",
+               "--workers", 2, *FEW)  # fmt: skip
     assert made.code == 0, made.err
     assert "could not be drawn" not in Path("report/index.html").read_text()
+    summary = json.loads(Path("report/summary.json").read_text())
+    assert summary["models"]["drawbar_pull"]["model"] == "janosi_pull"
 
 
 def test_models_travel_by_name_or_whole() -> None:
@@ -332,26 +287,26 @@ def test_models_travel_by_name_or_whole() -> None:
 def test_a_prior_in_another_unit_than_its_parameter_is_refused(
     run: Calib, right: str, wrong: str, words: list[str]
 ) -> None:
-    text = (HERE / "wheel_torque.py").read_text(encoding="utf-8")
+    text = own("wheel_torque.py").read_text(encoding="utf-8")
     assert text.count(right) == 1
-    own = Path("own.py")
-    own.write_text(text.replace(right, wrong), encoding="utf-8")
-    refused = run("models", "--models", own)
+    path = Path("own.py")
+    path.write_text(text.replace(right, wrong), encoding="utf-8")
+    refused = run("models", "--models", path)
     assert refused.code == 2
-    for word in (*words, f"{own.resolve()}, model 'janosi_torque'", "hint: convert"):
+    for word in (*words, f"{path.resolve()}, model 'janosi_torque'", "hint: convert"):
         assert word in refused.err
 
 
 def test_a_unit_written_otherwise_is_the_same(run: Calib) -> None:
-    text = (HERE / "wheel_torque.py").read_text(encoding="utf-8")
+    text = own("wheel_torque.py").read_text(encoding="utf-8")
     Path("own.py").write_text(text.replace('unit = "kN*m"', 'unit = "kN m"'), encoding="utf-8")
     assert run("models", "--models", "own.py").code == 0
 
 
 def test_ones_own_are_told_as_well(run: Calib) -> None:
-    own = ["--models", HERE / "wheel_torque.py"]
-    assert "wheel_torque_nm: N*m" in run("quantities", "wheel_torque", *own).out
-    assert "predicts" not in run("models", "janosi_torque", *own).err
-    assert "priors" in run("models", "janosi_torque", *own).out
-    told = run("effects", "load_sensitivity", "--effects", HERE / "load_sensitivity.py")
+    mine = ["--models", own("wheel_torque.py")]
+    assert "wheel_torque_nm: N*m" in run("quantities", "wheel_torque", *mine).out
+    assert "predicts" not in run("models", "janosi_torque", *mine).err
+    assert "priors" in run("models", "janosi_torque", *mine).out
+    told = run("effects", "load_sensitivity", "--effects", own("load_sensitivity.py"))
     assert told.code == 0, told.err

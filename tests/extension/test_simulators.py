@@ -19,12 +19,12 @@ import calib
 from calib.batch.folders import check_folder
 from calib.gap.case import Case
 from calib.models import MODELS
-from calib.models.simulators.registered import SIMULATED
+from calib.models.simulators.declaration import SIMULATED, read_simulator
+from calib.models.simulators.simulator import Failure
 from tests.cli.test_cli import Calib
 from tests.models.simulators.examples import PRIORS, lab, pull, write_program
 from tests.registered import forgotten
 
-HERE = Path(__file__).parent
 FEW = ["--max-steps", 400]
 
 
@@ -175,14 +175,6 @@ def test_a_data_folder_runs_no_command(run: Calib) -> None:
     assert not (Path("case") / "wheel.runs").exists()
 
 
-def test_wrong_input_is_named(run: Calib) -> None:
-    file = write_program(Path.cwd(), run='"./none {input}"')
-    refused = run("models", "--simulator", file)
-    assert refused.code == 2
-    for word in ("wheel.toml, run", "no program './none'", "hint"):
-        assert word in refused.err
-
-
 C_PROGRAM = r"""
 #include <math.h>
 #include <stdio.h>
@@ -294,3 +286,31 @@ def _wait_for(url: str, server: subprocess.Popen[bytes]) -> None:
         else:
             return
     raise AssertionError("the server does not answer")
+
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "chrono_scm"
+# Stands for a program around Chrono: it reads the soil in the order of SetSoilParameters.
+PROGRAM = """#!{python}
+import sys
+lines = [line.split() for line in open(sys.argv[1]) if not line.startswith("#")]
+values = {{name: [float(v) for v in rest] for name, *rest in lines}}
+assert [line[0] for line in lines][:6] == [
+    "Bekker_Kphi", "Bekker_Kc", "Bekker_n", "Mohr_cohesion", "Mohr_friction", "Janosi_shear"
+]
+for slip, load in zip(values["slip"], values["load"]):
+    print(f"Fx = {{load * slip * values['Mohr_friction'][0] / 30:.6f}} N")
+"""
+
+
+def test_chronos_parameters_have_its_order_and_units(tmp_path: Path) -> None:
+    shutil.copytree(EXAMPLE, tmp_path / "scm")
+    program = tmp_path / "scm" / "chrono_wheel"
+    program.write_text(PROGRAM.format(python=sys.executable))
+    program.chmod(0o755)
+    simulator = read_simulator(tmp_path / "scm" / "scm.toml").simulator
+    assert simulator.parameters == ("Kphi", "Kc", "n", "cohesion", "friction", "janosi")
+    theta = np.array([2e6, 0.0, 1.1, 100.0, 30.0, 0.01])
+    x = {"slip_ratio": np.array([0.1, 0.2]), "normal_load_kn": np.array([4.0, 5.0])}
+    found = simulator.run(theta, x)
+    assert not isinstance(found, Failure), found
+    np.testing.assert_allclose(found["drawbar_pull_kn"], [0.4, 1.0])

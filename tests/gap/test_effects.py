@@ -13,7 +13,7 @@ from calib.gap.effects import EFFECTS, Effect, View
 from calib.gap.effects.base import saturating
 from calib.gap.effects.dependence import DependsOn
 from calib.inference.prior_files import default_priors, read_priors
-from calib.models.latex import text
+from calib.models.card import text
 from tests.gap.cases import make_case, parameters, simulate
 
 OUTPUTS = ("pull", "sinkage", "density")

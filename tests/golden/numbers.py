@@ -22,7 +22,7 @@ import numpy as np
 import calib
 from calib.batch.user_code import run_file
 from calib.models import MODELS, example_csv
-from calib.models.simulators.registered import SIMULATED
+from calib.models.simulators.declaration import SIMULATED
 from calib.validation.replicate import Item, replicate
 from calib.validation.sbc import SETTINGS
 from challenge.make import make

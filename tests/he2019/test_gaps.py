@@ -40,8 +40,8 @@ from calib.he2019.sections import GapsSection, _withheld, check_text
 from calib.inference.calibration import calibrate
 from calib.inference.sampler import SamplerSettings
 from calib.models import get_model
-from calib.models.bekker import rut_depth as eq_21
 from calib.models.magic_formula import magic_formula
+from calib.models.soil import rut_depth as eq_21
 from calib.report.gap_facts import output_rows, short_name
 from calib.report.labels import odds_text, short
 from calib.report.sections import Report

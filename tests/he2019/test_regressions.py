@@ -32,7 +32,7 @@ from calib.he2019.estimators import rut_regression
 from calib.he2019.published import PUBLISHED
 from calib.inference.estimators import estimate
 from calib.inference.problem import build_problem
-from calib.models.ayers_perumpral import bulk_density
+from calib.models.soil import bulk_density
 from tests.he2019.altered import altered
 
 

@@ -82,7 +82,7 @@ def test_a_model_that_has_changed_is_told(
     """Its prediction would be another, in silence; rounding on another processor is none."""
     model = MODELS["modified_bekker"]
     changed = replace(
-        model, mean_response=lambda *args: model.mean_response(*args) + np.log(factor)
+        model, mean_response=lambda x, **p: model.mean_response(x, **p) + np.log(factor)
     )
     monkeypatch.setattr(io, "get_model", lambda name: changed)
     if not told:

@@ -72,7 +72,7 @@ def test_a_tile_has_one_value_of_the_condition_of_fewest(column: str) -> None:
         1
     ].tolist()
     for tile in squares.tiles:
-        assert min(np.ptp(v) for v in tile.rows.values()) == 0.0
+        assert min(np.ptp(v) for v in tile.conditions.values()) == 0.0
 
 
 def test_repeats_that_agree_leave_nothing_within() -> None:

@@ -14,7 +14,7 @@ from calib.errors import CalibError
 from calib.inference.design import try_simulator
 from calib.inference.random import generator
 from calib.models import MODELS
-from calib.models.simulators.registered import SIMULATED
+from calib.models.simulators.declaration import SIMULATED
 from tests.models.simulators.examples import PRIORS, lab, pull, serving, write_program
 from tests.registered import forgotten
 

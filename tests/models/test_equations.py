@@ -232,7 +232,7 @@ def test_binding_takes_the_references_from_the_data(name: str) -> None:
 def test_a_missing_condition_names_the_model_and_the_column() -> None:
     with pytest.raises(CalibError) as caught:
         MODELS["modified_bekker"].bind({"slip_ratio": np.array([0.1])})
-    for word in ("modified_bekker", "average_ground_pressure_kpa", "allowed", "hint"):
+    for word in ("modified_bekker", "average_ground_pressure_kpa", "expected", "hint"):
         assert word in str(caught.value)
 
 

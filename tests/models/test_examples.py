@@ -44,20 +44,6 @@ def test_a_template_of_ones_own_with_an_order_is_left_as_it_is(monkeypatch) -> N
     assert template_csv("own") == text
 
 
-def test_an_unknown_template_lists_the_models() -> None:
-    with pytest.raises(CalibError, match="there is no model 'magic'") as caught:
-        example_csv("magic")
-    assert all(name in str(caught.value) for name in MODELS)
-
-
-@pytest.mark.parametrize("name", MODELS)
-def test_a_model_says_when_it_applies(name: str) -> None:
-    model = MODELS[name]
-    assert model.applies.endswith(".")
-    assert model.latex
-    assert model.source
-
-
 def test_a_mistake_in_ones_own_predict_is_told_by_its_line():
     def predict(theta, conditions):
         return theta[:, :1] * conditions["load"]

@@ -10,7 +10,6 @@ from scipy.special import i1, modstruve
 
 from calib.errors import CalibError
 from calib.models import MODELS, Array, BoundModel, Conditions, Model
-from calib.models.magic_formula import coefficients_at
 from calib.models.traction import mobilised
 from tests.models.ranges import THETA, draw
 
@@ -36,36 +35,7 @@ def test_the_magic_formula_peaks_at_its_peak_factor_and_is_odd(seed: int) -> Non
     np.testing.assert_allclose(mirrored, -curve, rtol=1e-12)
 
 
-@FEW
-@given(seed=SEEDS)
-def test_shifts_move_the_curve(seed: int) -> None:
-    bound, theta, conditions = draw(seed, "magic_formula")
-    plain = theta.copy()
-    plain[:, 4:] = 0.0
-    moved = {"slip_ratio": conditions["slip_ratio"] + theta[0, 4] / 100.0}
-    np.testing.assert_allclose(
-        bound.predict(theta[0], moved),
-        bound.predict(plain[0], conditions) + theta[0, 5],
-        rtol=1e-9, atol=1e-9,
-    )  # fmt: skip
-
-
-@FEW
-@given(seed=SEEDS)
-def test_the_pressure_model_is_the_magic_formula_at_every_pressure(seed: int) -> None:
-    bound, theta, conditions = draw(seed, "magic_formula_pressure")
-    at = coefficients_at(theta, conditions["inflation_pressure_psi"], bound.references)
-    single = MODELS["magic_formula"].bind(conditions)
-    for i in range(theta.shape[0]):
-        for j in range(5):
-            coefficients = {name: float(v[i, j]) for name, v in at.items()}
-            one = {"slip_ratio": conditions["slip_ratio"][j : j + 1]}
-            expected = single.predict(single.theta(coefficients), one)[0, 0]
-            found = bound.predict(theta, conditions)[i, j]
-            assert found == pytest.approx(expected, rel=1e-9, abs=1e-12)
-
-
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(low=st.floats(0.01, 5), high=st.floats(0.01, 5), bend=st.floats(-4, 4))
 def test_a_quadratic_must_be_positive_between_the_end_pressures(
     low: float, high: float, bend: float
@@ -116,56 +86,6 @@ def test_one_pressure_cannot_bind_the_pressure_model() -> None:
     assert "fit the model magic_formula" in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["bekker", "modified_bekker"])
-@FEW
-@given(seed=SEEDS)
-def test_ruts_grow_with_ground_pressure(name: str, seed: int) -> None:
-    bound, theta, _ = draw(seed, name)
-    pressure = np.linspace(40.0, 250.0, 30)
-    conditions = {"average_ground_pressure_kpa": pressure, "slip_ratio": np.full(30, 0.15)}
-    assert np.all(np.diff(bound.predict(theta, conditions), axis=1) > 0.0)
-
-
-@FEW
-@given(seed=SEEDS)
-def test_ruts_below_a_metre_grow_with_slip_where_n1_is_positive(seed: int) -> None:
-    bound, theta, _ = draw(seed, "modified_bekker")
-    theta[:, 2] = np.abs(theta[:, 2]) + 0.01
-    slip = np.linspace(0.0, 0.3, 20)
-    rut = bound.predict(
-        theta, {"average_ground_pressure_kpa": np.full(20, 120.0), "slip_ratio": slip}
-    )
-    assert np.all(np.diff(rut, axis=1) > 0.0)
-    # p = p_ref here, so that without slip the rut is z_ref itself.
-    np.testing.assert_allclose(rut[:, 0], theta[:, 0], rtol=1e-12)
-
-
-def test_an_exponent_that_is_not_positive_has_no_value() -> None:
-    bound, theta, _ = draw(4, "modified_bekker", k=1)
-    theta[0] = 20.0, 1.0, -2.0
-    slip = np.array([0.0, 0.4, 0.5, 0.6])
-    location = bound.mean_response(
-        theta, {"average_ground_pressure_kpa": np.full(4, 100.0), "slip_ratio": slip}
-    )[0]
-    np.testing.assert_array_equal(np.isfinite(location), [True, True, False, False])
-
-
-@pytest.mark.parametrize("name", ["ayers_perumpral", "ayers_perumpral_volumetric"])
-@FEW
-@given(seed=SEEDS)
-def test_density_grows_with_cone_index_and_is_gamma_ref_at_the_reference(
-    name: str, seed: int
-) -> None:
-    bound, theta, _ = draw(seed, name)
-    water = next(c for c in bound.model.conditions if c.endswith("water_content"))
-    index = np.linspace(300.0, 2000.0, 20)
-    index[0] = bound.references["ci_ref_kpa"]
-    conditions = {"cone_index_kpa": index, water: np.full(20, bound.references["water_ref"])}
-    density = bound.predict(theta, conditions)
-    np.testing.assert_allclose(density[:, 0], theta[:, 0], rtol=1e-9)
-    assert np.all(np.diff(density[:, 1:], axis=1) > 0.0)
-
-
 @FEW
 @given(seed=SEEDS)
 def test_the_two_density_relations_agree_at_their_common_water(seed: int) -> None:
@@ -196,23 +116,11 @@ def test_the_two_density_relations_agree_at_their_common_water(seed: int) -> Non
 
 def test_a_density_does_not_depend_on_the_vectors_beside_it() -> None:
     """Not even where the equation has several roots, of which one is returned."""
-    bound, theta, conditions = draw(11, "ayers_perumpral_volumetric", k=2000, n=5)
+    bound, theta, conditions = draw(11, "ayers_perumpral_volumetric", k=100, n=5)
     theta[:, 1] = 3.0  # a small A2 gives several roots
     together = bound.predict(theta, conditions)
     alone = np.concatenate([bound.predict(row[None], conditions) for row in theta])
     np.testing.assert_allclose(together, alone, rtol=1e-12)
-
-
-def test_a_density_outside_the_bracket_has_no_value() -> None:
-    bound, theta, _ = draw(5, "ayers_perumpral_volumetric", k=1)
-    theta[0] = 1.5, 8.0, 0.01, 0.1
-    conditions = {
-        "cone_index_kpa": np.array([700.0, 1e15]),
-        "volumetric_water_content": np.array([0.08, 0.08]),
-    }
-    location = bound.mean_response(theta, conditions)[0]
-    assert location[0] == pytest.approx(1.5)
-    assert np.isnan(location[1])
 
 
 def test_a_density_just_outside_the_bracket_has_none_either() -> None:
@@ -228,9 +136,9 @@ def test_a_density_just_outside_the_bracket_has_none_either() -> None:
 
 
 def test_the_implicit_solver_handles_thousands_of_vectors_at_once() -> None:
-    bound, theta, conditions = draw(6, "ayers_perumpral_volumetric", k=4000, n=7)
+    bound, theta, conditions = draw(6, "ayers_perumpral_volumetric", k=1000, n=7)
     density = bound.predict(theta, conditions)
-    assert density.shape == (4000, 7)
+    assert density.shape == (1000, 7)
     A2, A3, A4 = (theta[:, j, None] for j in (1, 2, 3))
     ln_a1 = np.log(bound.report(theta)["A1"])[:, None]
     water = conditions["volumetric_water_content"] / density
@@ -254,18 +162,6 @@ def test_upadhyayas_form_at_no_slip_at_a_fifth_and_at_its_limit(seed: int) -> No
     np.testing.assert_allclose(coefficient, np.stack([-r, p20, a], axis=1), rtol=1e-12)
 
 
-def test_upadhyayas_form_with_b_of_one_has_no_pull_without_slip() -> None:
-    bound = MODELS["upadhyaya"].bind(
-        {"slip_ratio": np.array([0.0]), "normal_load_kn": np.array([5.0])}
-    )
-    theta = bound.theta({"a": 0.6, "b": 1.0, "c": 8.0})
-    assert theta[1] == 0.0
-    steep = {"slip_ratio": np.array([0.0, 1e-6]), "normal_load_kn": np.full(2, 5.0)}
-    pull = bound.predict(theta, steep)[0]
-    assert pull[0] == 0.0
-    assert pull[1] / 1e-6 == pytest.approx(5.0 * 0.6 * 8.0, rel=1e-5)
-
-
 def test_the_mobilised_part_of_an_elliptic_contact_is_bessel_and_struve() -> None:
     q = np.geomspace(1e-3, 8.0, 40)
     bessel = 1.0 - 2.0 / q * (i1(q) - modstruve(1, q))
@@ -279,33 +175,6 @@ def test_the_mobilised_part_of_an_elliptic_contact_is_bessel_and_struve() -> Non
     expected = 4.0 / np.pi / (0.5 * (far[1:] + far[:-1])) ** 2
     np.testing.assert_allclose(slope, expected, rtol=0.01)
     np.testing.assert_allclose(mobilised(np.array([1e6])), 1.0 - 4e-6 / np.pi, rtol=1e-12)
-
-
-@FEW
-@given(seed=SEEDS)
-def test_an_elliptic_contact_that_slides_has_the_strength_of_its_area(seed: int) -> None:
-    bound, theta, conditions = draw(seed, "elliptic_contact")
-    theta[:, 2] = 1e-9
-    conditions["slip_ratio"] = np.abs(conditions["slip_ratio"]) + 0.01
-    soil = {name: v[:, None] for name, v in bound.report(theta).items()}
-    load = conditions["normal_load_kn"]
-    area = np.pi / 4e6 * conditions["contact_length_mm"] * conditions["contact_width_mm"]
-    strength = area * soil["c"] + load * np.tan(np.radians(soil["phi"]))
-    np.testing.assert_allclose(
-        bound.predict(theta, conditions), strength - soil["rho"] * load, rtol=1e-6, atol=1e-9
-    )
-
-
-def test_at_one_pressure_cohesion_and_friction_cannot_be_told_apart() -> None:
-    conditions = {
-        "slip_ratio": np.array([0.05, 0.1, 0.3]), "normal_load_kn": np.full(3, 5.0),
-        "contact_length_mm": np.full(3, 250.0), "contact_width_mm": np.full(3, 180.0),
-    }  # fmt: skip
-    bound = MODELS["elliptic_contact"].bind(conditions)
-    theta = np.array([[0.6, 0.0, 14.0, 0.1], [0.6, 0.9, 14.0, 0.1]])
-    pulls = bound.predict(theta, conditions)
-    np.testing.assert_allclose(pulls[0], pulls[1], rtol=1e-12)
-    assert bound.report(theta)["phi"][0] > bound.report(theta)["phi"][1] + 20.0
 
 
 @FEW

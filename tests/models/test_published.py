@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from calib.models import MODELS
-from calib.models.bekker import rut_depth
 from calib.models.magic_formula import coefficients_at
+from calib.models.soil import rut_depth
 
 TABLE_4 = {
     18: (0.0794, 1.5619, 1.6480, -0.1026),

@@ -9,12 +9,15 @@ import pytest
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
-from calib.models.base import columns
 from calib.models.wong_reece import contact
 from tests.models.ranges import draw
 
 NAMES = ("k1", "k2", "n", "c", "phi", "K", "c1", "c2")
 INCH, PSI, POUND = 0.0254, 6.894757, 4.4482216e-3  # m, kPa, kN
+
+
+def contact_at(theta, conditions):
+    return contact(conditions, **dict(zip(NAMES, theta.T[:, :, None], strict=True)))
 
 
 def integrate(p, c):
@@ -54,7 +57,7 @@ def integrate(p, c):
 
 def test_quadrature_of_all_rows_is_adaptive_quadrature_of_each() -> None:
     _, theta, conditions = draw(3, "wong_reece_pull", k=3, n=3)
-    found = contact(columns(theta), conditions)
+    found = contact_at(theta, conditions)
     for i in range(3):
         for j in range(3):
             expected = integrate(
@@ -66,27 +69,16 @@ def test_quadrature_of_all_rows_is_adaptive_quadrature_of_each() -> None:
             np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize(("name", "field", "scale"), [
-    ("wong_reece_pull", "pull", 1.0), ("wong_reece_torque", "torque", 1.0),
-    ("wong_reece_sinkage", "sinkage", 1000.0),
-])  # fmt: skip
-def test_each_model_is_its_part_of_the_contact(name: str, field: str, scale: float) -> None:
-    bound, theta, conditions = draw(4, name)
-    whole = contact(columns(theta), conditions)
-    found = bound.predict(theta, conditions)
-    np.testing.assert_allclose(found, scale * getattr(whole, field), rtol=1e-9)
-
-
 def test_a_wheel_is_the_same_alone_and_among_many() -> None:
     _, theta, conditions = draw(5, "wong_reece_pull", k=60, n=50)
     # One in fifty so heavy that few soils carry it: these take longer.
     conditions["normal_load_kn"][7] = 60.0
-    among = contact(columns(theta), conditions)
+    among = contact_at(theta, conditions)
     assert 0 < np.isfinite(among.pull[:, 7]).sum() < 60
     assert np.all(np.delete(among.torque, 7, axis=1) > 0.0)
     for j in (3, 7):
         row = {name: v[j : j + 1] for name, v in conditions.items()}
-        alone = contact(columns(theta), row)
+        alone = contact_at(theta, row)
         for field in ("pull", "torque", "sinkage"):
             got, expected = getattr(alone, field)[:, 0], getattr(among, field)[:, j]
             np.testing.assert_allclose(got, expected, rtol=1e-9, atol=1e-9)
@@ -94,9 +86,9 @@ def test_a_wheel_is_the_same_alone_and_among_many() -> None:
 
 def test_braked_and_bottomless_wheels_have_no_value() -> None:
     _, theta, conditions = draw(6, "wong_reece_pull", k=2, n=2)
-    braked = contact(columns(theta), conditions | {"slip_ratio": np.array([-0.1, 0.1])})
+    braked = contact_at(theta, conditions | {"slip_ratio": np.array([-0.1, 0.1])})
     assert np.isnan(braked.pull).tolist() == [[True, False]] * 2
-    heavy = contact(columns(theta), conditions | {"normal_load_kn": np.array([1e6, 1.0])})
+    heavy = contact_at(theta, conditions | {"normal_load_kn": np.array([1e6, 1.0])})
     assert np.isnan(heavy.pull).tolist() == [[True, False]] * 2
 
 
@@ -122,7 +114,7 @@ def test_soils_of_the_source_as_another_program_finds_them(
     theta = np.array([[k1 * PSI, k2 * PSI / INCH, n, c * PSI, phi, 1000.0 * K * INCH, c1, c2]])
     rows = {"slip_ratio": slip, "normal_load_kn": load * POUND, "tyre_width_m": width * INCH,
             "tyre_diameter_m": 2.0 * 24.7 * INCH}  # fmt: skip
-    found = contact(columns(theta), {name: np.array([v]) for name, v in rows.items()})
+    found = contact_at(theta, {name: np.array([v]) for name, v in rows.items()})
     sinkage = 24.7 * INCH * (1.0 - math.cos(math.radians(entry)))
     # Printed to seven or eight digits, from adaptive quadrature to 1e-7.
     np.testing.assert_allclose(found.sinkage[0, 0], sinkage, rtol=1e-6)

@@ -18,7 +18,7 @@ from calib.batch.folders import read_folder
 from calib.errors import CalibError
 from calib.inference.emulation import Emulation
 from calib.models import MODELS, Model
-from calib.models.simulators.registered import simulated_by
+from calib.models.simulators.declaration import simulated_by
 from calib.report.numbers import finite
 
 

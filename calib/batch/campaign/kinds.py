@@ -52,8 +52,8 @@ from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
 from calib.inference.sampler import SamplerSettings
 from calib.models import get_model
+from calib.models.simulators.declaration import slow_simulator
 from calib.models.simulators.emulator import emulator_of, save_emulator
-from calib.models.simulators.registered import slow_simulator
 from calib.report.page.diagnosis import write_page
 from calib.report.study_tasks import HoldOut, read_and_split
 from calib.report.verdict import Verdict, keep_verdict, verdict

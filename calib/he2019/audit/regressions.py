@@ -49,7 +49,7 @@ from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
 from calib.inference.sampler import Progress
 from calib.models.base import Array
-from calib.models.bekker import rut_depth
+from calib.models.soil import rut_depth
 
 # Cone indices of soils that carry a wheel but let it sink, kPa.
 _CONE_INDEX = Interval(np.array(100.0), np.array(3000.0))

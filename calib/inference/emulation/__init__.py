@@ -50,9 +50,10 @@ from calib.inference.emulation.state import (
 from calib.inference.problem import Problem
 from calib.inference.random import generator
 from calib.models.base import Array
+from calib.models.constants import FIRST_RUNS
 from calib.models.simulators.emulator import Emulator
 from calib.models.simulators.kriging import correlation
-from calib.models.simulators.runs import FIRST, FROM_THE_START, Run, RunKeeper, fail_alike
+from calib.models.simulators.simulator import FROM_THE_START, Run, RunKeeper, fail_alike
 
 __all__ = ["Emulation", "EmulationSettings", "HeldOut", "emulate", "extend"]
 
@@ -209,15 +210,15 @@ def _first_design(state: State, chosen: EmulationSettings) -> float:
         state.problem, chosen.spread(d, deterministic, before), state.seed,
         latin=not chosen.sequential,
     )  # fmt: skip
-    values, across = state.carry_out(theta[:FIRST]), state.across
+    values, across = state.carry_out(theta[:FIRST_RUNS]), state.across
     if fail_alike(state.runs[before:]) and fail_alike(state.runs):
         raise state.without_value(FROM_THE_START)
     # An output in another unit, too, need not be paid for with the whole design.
     check_scale(state.problem, state.outputs(values), state.keeper.simulator)
     state.runs = [*map(across_too, state.runs[:before]), *state.runs[before:]]
     # Runs that failed across zero and were made again may have taken some of them.
-    theta = theta[: FIRST + state.left]
-    more = state.carry_out(theta[FIRST:])
+    theta = theta[: FIRST_RUNS + state.left]
+    more = state.carry_out(theta[FIRST_RUNS:])
     if more.shape[1] < values.shape[1]:  # one of these had a value but for the nodes across zero
         values = values[:, ~across]
     values = np.concatenate([values, more])

@@ -26,12 +26,16 @@ from calib.inference.prior_files import PriorFile
 from calib.inference.problem import Problem, build_problem
 from calib.models import get_model
 from calib.models.base import Array
-from calib.models.simulators.base import FAILED, Failure, Simulator
+from calib.models.simulators.declaration import (
+    SIMULATED,
+    Simulated,
+    load_files,
+    simulated_by,
+    slow_simulator,
+)
 from calib.models.simulators.emulator import Emulator, Training, emulator_of, save_emulator
-from calib.models.simulators.files import load_files
-from calib.models.simulators.registered import SIMULATED, Simulated, simulated_by, slow_simulator
-from calib.models.simulators.runs import Run, RunKeeper
-from calib.models.simulators.ways import TableWay, columns_of
+from calib.models.simulators.runner import TableRunner, columns_of
+from calib.models.simulators.simulator import FAILED, Failure, Run, RunKeeper, Simulator
 
 
 def emulate_table(
@@ -67,8 +71,8 @@ def read_runs(simulator: Simulator, problem: Problem) -> Training:
         If a column is missing, a cell is no number, there are too few runs, or the runs do not
         all have the same conditions.
     """
-    way = simulator.way
-    if not isinstance(way, TableWay):
+    way = simulator.runner
+    if not isinstance(way, TableRunner):
         raise ValueError(f"{simulator.name} is no table")
     found, lines = _columns(way.path)
     output = next(
@@ -206,7 +210,7 @@ def emulated(
     problem.noise.must_be_usual(problem.priors.source, "an emulator")
     found = _simulated(problem.bound.model.name)
     settings = EmulationSettings(**(found.budget or {}))  # type: ignore[arg-type]
-    if isinstance(found.simulator.way, TableWay):
+    if isinstance(found.simulator.runner, TableRunner):
         return emulate_table(problem, found.simulator, seed, settings, progress)
     keeper = _keeper(found, workers, scheduler, progress, settings.runs)
     return emulate(
@@ -286,7 +290,7 @@ def prepare_field(
     None where no run can be made: of no slow simulator, or of a table of runs.
     """
     found, emulator = simulated_by(model), emulator_of(get_model(model))
-    if found is None or emulator is None or not found.simulator.way.runs:
+    if found is None or emulator is None or not found.simulator.runner.runs:
         return None
     problem = build_problem(model, field, priors)
     emulation = _extended(found, emulator, problem, seed, workers, progress)
@@ -309,7 +313,7 @@ def emulated_for_both(
     """
     found = _simulated(model)
     first = emulated(build_problem(model, lab, priors), seed, elsewhere=[field, *elsewhere])
-    if not found.simulator.way.runs:
+    if not found.simulator.runner.runs:
         return [first]
     problem = build_problem(model, field, priors)
     return [first, _extended(found, first.emulator, problem, seed, 1, None)]

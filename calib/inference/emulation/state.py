@@ -27,7 +27,7 @@ from calib.models.simulators.emulator import (
     emulated_model,
 )
 from calib.models.simulators.kriging import Region
-from calib.models.simulators.runs import Run, RunKeeper, without_value
+from calib.models.simulators.simulator import Run, RunKeeper, without_value
 
 # What is being done, how much of it is done, and of how much.
 type Progress = Callable[[str, int, int], None]

@@ -28,20 +28,19 @@ from numpy.typing import NDArray
 
 from calib.errors import CalibError
 from calib.models import MODELS, get_model
-from calib.models.base import Array, Columns, Conditions, Model, References, Rows, not_given
+from calib.models.base import Array, Conditions, Model
+from calib.models.constants import BEYOND_RUNS, FEW_RUNS, LEFT_OUT, LENGTH_RUNS, MOST_CURVES
 from calib.models.simulators.kriging import (
-    AT_ONCE,
     Kriging,
     Over,
     Region,
     Scales,
+    chunks,
     correlation,
     find_scales,
     krige,
     over_conditions,
 )
-
-_SUPPORT_LENGTHS = (0.2, 10.0)
 
 
 @dataclass(frozen=True)
@@ -59,13 +58,9 @@ class Support:
 
     def latent(self, at: Array) -> Array:
         """Return what is positive where a value is the likelier outcome, (k, d) to (k,)."""
-        found = np.empty(len(at))
-        for i in range(0, len(at), AT_ONCE):
-            found[i : i + AT_ONCE] = (
-                correlation(at[i : i + AT_ONCE], self.x, self.lengths) @ self.weights
-            )
         # Zero far from all runs.
-        return self.amplitude * found
+        found = [correlation(some, self.x, self.lengths) @ self.weights for some in chunks(at)]
+        return self.amplitude * np.concatenate(found)
 
 
 def learn_support(x: Array, ok: NDArray[np.bool_]) -> Support | None:
@@ -79,7 +74,7 @@ def learn_support(x: Array, ok: NDArray[np.bool_]) -> Support | None:
     from sklearn.gaussian_process import GaussianProcessClassifier
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
-    kernel = ConstantKernel(10.0, (1.0, 1e3)) * RBF(np.full(x.shape[1], 1.5), _SUPPORT_LENGTHS)
+    kernel = ConstantKernel(10.0, (1.0, 1e3)) * RBF(np.full(x.shape[1], 1.5), (0.2, 10.0))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
         fitted = GaussianProcessClassifier(kernel).fit(x, ok).base_estimator_
@@ -89,17 +84,6 @@ def learn_support(x: Array, ok: NDArray[np.bool_]) -> Support | None:
         x, np.asarray(weights), np.atleast_1d(found.k2.length_scale) * np.ones(x.shape[1]),
         float(found.k1.constant_value),
     )  # fmt: skip
-
-
-_MOST_CURVES = 14
-# Truncation error of the basis over the negligible error, near the posterior and elsewhere.
-_LEFT_OUT = (1.0, 20.0)
-# Runs from which the length scales over conditions are estimated.
-_CURVES = 12
-# Prior sds beyond the successful runs within which the emulator has a value.
-_BEYOND = 1.0
-# Runs in a region from which the basis is built for it.
-_FEW = 8
 
 
 @dataclass(frozen=True)
@@ -229,7 +213,7 @@ class Emulator:
     @cached_property
     def _box(self) -> tuple[Array, Array]:
         z = self.axes.of(self.training.theta[self.training.ok])
-        return z.min(axis=0) - _BEYOND, z.max(axis=0) + _BEYOND
+        return z.min(axis=0) - BEYOND_RUNS, z.max(axis=0) + BEYOND_RUNS
 
     def holds(self, z: Array) -> NDArray[np.bool_]:
         """Whether the simulator has a value at z, in units of the prior's sds; (k, d) to (k,).
@@ -262,14 +246,14 @@ def _basis(near: Array, all_values: Array, negligible: float) -> tuple[Array, Ar
     """Return mean and orthonormal curves: first what near runs need, then what the others do."""
     mean = near.mean(axis=0)
     curves = np.zeros((0, mean.size))
-    for values, left in ((near, _LEFT_OUT[0]), (all_values, _LEFT_OUT[1])):
+    for values, left in zip((near, all_values), LEFT_OUT, strict=True):
         rest = values - mean
         rest = rest - (rest @ curves.T) @ curves
         _, size, right = np.linalg.svd(rest, full_matrices=False)
         # Mean square left out if the curves end before the i-th.
         open_ = np.append(np.cumsum((size**2)[::-1])[::-1], 0.0) / values.size
         count = int(np.argmax(open_ <= (left * negligible) ** 2))
-        curves = np.concatenate([curves, right[: min(count, _MOST_CURVES - len(curves))]])
+        curves = np.concatenate([curves, right[: min(count, MOST_CURVES - len(curves))]])
     if not len(curves):
         curves = np.ones((1, mean.size)) / np.sqrt(mean.size)
     return mean, curves
@@ -296,13 +280,13 @@ def build_emulator(
     inside = np.zeros(len(values), dtype=bool)
     for region in regions:
         inside |= region.inside(z[ok])
-    near = values[inside] if inside.sum() >= _FEW else values
+    near = values[inside] if inside.sum() >= FEW_RUNS else values
     mean, curves = _basis(near, values, negligible)
     coefficients = (values - mean) @ curves.T
     if scales is None or not known:
         scales = find_scales(z[ok], coefficients, noisy=training.noisy, start=scales)
     if over is None:
-        some = near[np.linspace(0, len(near) - 1, min(_CURVES, len(near))).astype(int)]
+        some = near[np.linspace(0, len(near) - 1, min(LENGTH_RUNS, len(near))).astype(int)]
         over = over_conditions(training.nodes, some)
     return Emulator(
         training, axes, negligible, mean, curves, krige(z[ok], coefficients, scales), over,
@@ -324,28 +308,14 @@ def _near(
 
 
 @dataclass(frozen=True)
-class _Prepare:
-    """The basis curves at conditions."""
-
-    emulator: Emulator
-
-    def __call__(self, conditions: Conditions, references: References) -> Rows:
-        found = self.emulator.curves_at(conditions)
-        return {str(j): np.ascontiguousarray(found[..., j]) for j in range(found.shape[-1])}
-
-
-@dataclass(frozen=True)
 class _MeanResponse:
-    """Mean curve plus coefficients times curves."""
+    """The emulator's prediction, as `Model.mean_response`."""
 
     emulator: Emulator
 
-    def __call__(self, columns: Columns, rows: Rows, references: References) -> Array:
-        coefficients = self.emulator.coefficients(np.concatenate(columns, axis=1))
-        found = rows["0"] + np.zeros_like(columns[0])
-        for j, c in enumerate(coefficients.T, start=1):
-            found = found + c[:, None] * rows[str(j)]
-        return np.asarray(found)
+    def __call__(self, conditions: Conditions, /, **parameters: Array) -> Array:
+        asked = {name: conditions[name] for name in self.emulator.training.nodes}
+        return self.emulator.predict(np.concatenate(list(parameters.values()), axis=1), asked)
 
 
 @dataclass(frozen=True)
@@ -364,9 +334,8 @@ class _Uncertain:
 def emulated_model(model: Model, emulator: Emulator) -> Model:
     """Return a model with an emulator in the place of its equation."""
     return replace(
-        model, predict=None, prepare=_Prepare(emulator), mean_response=_MeanResponse(emulator),
-        uncertain=_Uncertain(emulator), report_theta=not_given,
-    )  # fmt: skip
+        model, predict=None, mean_response=_MeanResponse(emulator), uncertain=_Uncertain(emulator)
+    )
 
 
 def emulator_of(model: Model) -> Emulator | None:

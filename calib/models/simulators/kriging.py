@@ -5,13 +5,13 @@
 
 with b the constant and the coordinates, beta flat beforehand (Rasmussen & Williams 2006, *Gaussian
 Processes for Machine Learning*, section 2.7). The functions share r: whatever their number, a point
-costs one row of correlations and one product with a matrix of n on a side.
+costs one row of correlations and one product with a matrix of n on a side. The length scales are
+scikit-learn's, whose `GaussianProcessRegressor` has no trend and no error of what is left out.
 
 The length scales maximise the likelihood of one process with one variance for all functions, so
 that those that vary most count most. Each s_j^2 is the geometric mean of two estimates: the
 likelihood's, which takes the length scales as known and is too sure, and that of the leave-one-out
-errors (section 5.4.2), of which those at the edge are large. scikit-learn's
-`GaussianProcessRegressor` finds the same length scales in ten times the time, and has no trend.
+errors (section 5.4.2), of which those at the edge are large.
 
 Over conditions, every run gives its outputs at the same *nodes*, so the covariance over parameters
 and conditions is a product, and one smooth process through the nodes serves all runs.
@@ -20,25 +20,26 @@ and conditions is a product, and one smooth process through the nodes serves all
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
-from scipy.linalg.blas import dtrmm
 
 from calib.models.base import Array
-
-# Bounds of the nugget, relative to the variance of the process.
-_NUGGET, _NOISY = 1e-9, 1.0
-_LENGTHS = (0.2, 100.0)
-_STEPS = 40
-# Keeps the matrix positive definite at the smallest nugget.
-_JITTER = 1e-10
-# Points evaluated at once.
-AT_ONCE = 512
+from calib.models.constants import (
+    AT_ONCE,
+    BEYOND_NODES,
+    LENGTHS,
+    NODE_LENGTHS,
+    NUGGETS,
+    NUGGETS_NOISY,
+    NUGGETS_OVER,
+    STEP_INSIDE,
+)
 
 
 @dataclass(frozen=True)
@@ -71,27 +72,23 @@ class Kriging:
 
     def mean(self, at: Array) -> Array:
         """Return the means at points, shape (k, d) to (k, j)."""
-        found = np.empty((len(at), self.beta.shape[1]))
-        for i in range(0, len(at), AT_ONCE):
-            some = slice(i, i + AT_ONCE)
-            r = correlation(at[some], self.x, self.scales.lengths)
-            found[some] = trend_of(at[some]) @ self.beta + r @ self.gamma
-        return found
+        lengths = self.scales.lengths
+        found = [
+            trend_of(some) @ self.beta + correlation(some, self.x, lengths) @ self.gamma
+            for some in chunks(at)
+        ]
+        return np.concatenate(found)
 
     def mean_and_unknown(self, at: Array) -> tuple[Array, Array]:
         """Return means (k, j), and which part of `variances` is left at points, shape (k,)."""
-        means, unknown = np.empty((len(at), self.beta.shape[1])), np.empty(len(at))
-        for i in range(0, len(at), AT_ONCE):
-            some = slice(i, i + AT_ONCE)
-            r = correlation(at[some], self.x, self.scales.lengths)
-            b = trend_of(at[some])
-            means[some] = b @ self.beta + r @ self.gamma
+        means, unknown = [], []
+        for some in chunks(at):
+            r, b = correlation(some, self.x, self.scales.lengths), trend_of(some)
+            means.append(b @ self.beta + r @ self.gamma)
             open_trend = (b - r @ self.trend.T) @ self.trend_root.T
-            # Overwrites the correlations.
-            left = dtrmm(1.0, self.root, r.T, lower=1, overwrite_b=1).T
-            part = 1.0 - np.einsum("kn,kn->k", left, left)
-            unknown[some] = part + np.einsum("kq,kq->k", open_trend, open_trend)
-        return means, np.maximum(unknown, 0.0)
+            left = 1.0 - np.square(r @ self.root.T).sum(axis=1)
+            unknown.append(left + np.square(open_trend).sum(axis=1))
+        return np.concatenate(means), np.maximum(np.concatenate(unknown), 0.0)
 
     def left_out(self) -> tuple[Array, Array]:
         """Return errors of the values, (n, j), and their parts of `variances`, (n,), if left out.
@@ -102,6 +99,11 @@ class Kriging:
         return self.gamma * unknown[:, None], unknown
 
 
+def chunks(at: Array) -> Iterator[Array]:
+    """Return points (k, d) a few at a time, at least once: correlations take memory."""
+    return (at[i : i + AT_ONCE] for i in range(0, max(len(at), 1), AT_ONCE))
+
+
 def trend_of(x: Array) -> Array:
     """Return the trend's functions, shape (k, 1 + d)."""
     return np.concatenate([np.ones((len(x), 1)), x], axis=1)
@@ -109,13 +111,12 @@ def trend_of(x: Array) -> Array:
 
 def correlation(a: Array, b: Array, lengths: Array) -> Array:
     """Return the correlations of the process, shapes (k, d) and (n, d) to (k, n)."""
-    a, b = a / lengths, b / lengths
-    squared = a @ (-2.0 * b.T)
-    squared += np.einsum("kd,kd->k", a, a)[:, None]
-    squared += np.einsum("nd,nd->n", b, b)
-    np.maximum(squared, 0.0, out=squared)
-    squared *= -0.5
-    return np.asarray(np.exp(squared, out=squared))
+    return np.asarray(np.exp(-0.5 * _squared_distances(a / lengths, b / lengths)))
+
+
+def _squared_distances(a: Array, b: Array) -> Array:
+    squared = np.square(a).sum(axis=1)[:, None] + np.square(b).sum(axis=1) - 2.0 * (a @ b.T)
+    return np.asarray(np.maximum(squared, 0.0))
 
 
 def krige(x: Array, y: Array, scales: Scales) -> Kriging:
@@ -123,7 +124,7 @@ def krige(x: Array, y: Array, scales: Scales) -> Kriging:
     n = len(x)
     b = trend_of(x)
     lower = cholesky(correlation(x, x, scales.lengths) + scales.nugget * np.eye(n), lower=True)
-    root = np.asfortranarray(solve_triangular(lower, np.eye(n), lower=True))
+    root = solve_triangular(lower, np.eye(n), lower=True)
     within = root @ b
     # Allows for coordinates that did not vary.
     precision = within.T @ within
@@ -153,49 +154,30 @@ def find_scales(x: Array, y: Array, *, noisy: bool = False, start: Scales | None
     Of values y (n, j) at x (n, d). The nugget stays small unless values at one point may differ
     (`noisy`); `start` is where to begin.
     """
-    from scipy.optimize import minimize  # late: a tenth of a second, and few commands emulate
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
     b = trend_of(x)
     rest = y - b @ np.linalg.lstsq(b, y, rcond=None)[0]
     spread = float(np.sqrt(np.square(rest).mean()))
     if spread <= 1e-12 * max(float(np.abs(y).max()), 1e-300):
         return start or Scales(np.full(x.shape[1], 3.0), 1e-6)
+    nuggets = NUGGETS_NOISY if noisy else NUGGETS
     lengths = np.full(x.shape[1], 2.0) if start is None else np.clip(start.lengths, 0.3, 60.0)
-    most = _NOISY if noisy else 1e-3
-    nugget = 1e-5 if start is None else float(np.clip(start.nugget, 2 * _NUGGET, 0.5 * most))
-    bounds = np.log([*[_LENGTHS] * x.shape[1], (_NUGGET, most)])
-    # The last digits of a length scale do not matter.
-    found = minimize(
-        minus_log_likelihood, np.log([*lengths, nugget]),
-        (np.square(x.T[:, :, None] - x.T[:, None]), rest / spread),
-        method="L-BFGS-B", jac=True, bounds=bounds, options={"maxiter": _STEPS},
-    )  # fmt: skip
-    scales = np.exp(found.x)
-    return Scales(scales[:-1], float(scales[-1]))
+    nugget = 1e-5 if start is None else start.nugget
+    nugget = float(np.clip(nugget, 2.0 * nuggets[0], 0.5 * nuggets[1]))
+    shape = RBF(lengths, LENGTHS) + WhiteKernel(nugget, nuggets)
+    found = fitted_kernel(ConstantKernel(1.0, (1e-2, 1e6)) * shape, x, rest / spread, 1e-10).k2
+    return Scales(np.atleast_1d(found.k1.length_scale), float(found.k2.noise_level))
 
 
-def minus_log_likelihood(logs: Array, squares: Array, y: Array) -> tuple[float, Array]:
-    """Return minus the log likelihood at its best variance, without a trend, and its gradient.
+def fitted_kernel(kernel: Any, x: Array, y: Array, alpha: float) -> Any:
+    """Return a kernel at its greatest marginal likelihood, by scikit-learn."""
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.gaussian_process import GaussianProcessRegressor
 
-    Rasmussen & Williams (2006), equations 2.30 and 5.9, with one variance for all functions y (n,
-    j). `logs` (d + 1,) are logarithms of the length scales and the nugget, `squares` (d, n, n)
-    squared distances along each coordinate.
-    """
-    lengths, nugget, n = np.exp(logs[:-1]), np.exp(logs[-1]), y.size
-    smooth = np.exp(-0.5 * np.tensordot(lengths**-2.0, squares, axes=1))
-    eye = np.eye(len(y))
-    try:
-        lower = cholesky(smooth + (nugget + _JITTER) * eye, lower=True)
-    except np.linalg.LinAlgError:
-        return np.inf, np.zeros_like(logs)
-    inverse = cho_solve((lower, True), eye)
-    gamma = inverse @ y
-    level = float(np.vdot(y, gamma)) / n
-    log_det = 2.0 * y.shape[1] * np.log(np.diag(lower)).sum()
-    value = 0.5 * (n * (np.log(2.0 * np.pi * level) + 1.0) + log_det)
-    off = 0.5 * (y.shape[1] * inverse - gamma @ gamma.T / level)
-    by_length = squares.reshape(len(lengths), -1) @ (off * smooth).ravel() / lengths**2
-    return float(value), np.array([*by_length, nugget * np.trace(off)])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        return GaussianProcessRegressor(kernel, alpha=alpha).fit(x, y).kernel_
 
 
 @dataclass(frozen=True)
@@ -217,14 +199,6 @@ class Region:
     def inside(self, z: Array) -> NDArray[np.bool_]:
         """Whether points lie in it, (k, d) to (k,)."""
         return np.asarray(np.linalg.norm(self.coordinates(z), axis=1) <= self.reach)
-
-
-_NUGGET_OVER = 1e-8
-# The smallest that gives a factor is taken.
-_NUGGETS = (1e-13, 1e-12, 1e-11, 1e-10, 1e-9)
-# Curves are extrapolated linearly by so much of the width of the nodes' box, and NaN beyond.
-BEYOND = 0.15
-_INSIDE = 0.02
 
 
 @dataclass(frozen=True)
@@ -272,9 +246,9 @@ class Over:
         if rows.size:
             # Linearly, from a point a little farther in.
             far = np.abs(out[rows]).max(axis=1, keepdims=True)
-            back = self._smooth(inside[rows] - _INSIDE * out[rows] / far, weights)
-            found[rows] += (found[rows] - back) * (far / _INSIDE)
-            found[rows[far[:, 0] > BEYOND + 1e-9]] = np.nan
+            back = self._smooth(inside[rows] - STEP_INSIDE * out[rows] / far, weights)
+            found[rows] += (found[rows] - back) * (far / STEP_INSIDE)
+            found[rows[far[:, 0] > BEYOND_NODES + 1e-9]] = np.nan
         return found
 
     def _smooth(self, u: Array, weights: Array) -> Array:
@@ -284,10 +258,10 @@ class Over:
         if not self.columns:
             return np.eye(len(self.nodes)), True
         k = _matern(self.nodes, self.nodes, self.lengths)
-        for nugget in _NUGGETS:
+        for nugget in NUGGETS_OVER[:-1]:
             with suppress(np.linalg.LinAlgError):
                 return cho_factor(k + nugget * np.eye(len(k)), lower=True)[0], True
-        return cho_factor(k + _NUGGET_OVER * np.eye(len(k)), lower=True)[0], True
+        return cho_factor(k + NUGGETS_OVER[-1] * np.eye(len(k)), lower=True)[0], True
 
     def left_out(self, curves: Array) -> Array:
         """Return the errors at each node were it not one, shape (j, m) to (j, m)."""
@@ -299,9 +273,7 @@ class Over:
 
 
 def _matern(a: Array, b: Array, lengths: Array) -> Array:
-    a, b = a / lengths, b / lengths
-    squared = ((a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1)) - 2.0 * (a @ b.T)
-    r = np.sqrt(np.maximum(5.0 * squared, 0.0))
+    r = np.sqrt(5.0 * _squared_distances(a / lengths, b / lengths))
     return np.asarray((1.0 + r + r * r / 3.0) * np.exp(-r))
 
 
@@ -322,14 +294,10 @@ def over_conditions(
 
 
 def _lengths(u: Array, curves: Array) -> Array:
-    from sklearn.exceptions import ConvergenceWarning
-    from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import ConstantKernel, Matern
 
     spread = curves.std(axis=1, keepdims=True)
     scaled = ((curves - curves.mean(axis=1, keepdims=True)) / np.where(spread > 0, spread, 1.0)).T
-    kernel = ConstantKernel(1.0, (1e-1, 1e5)) * Matern(np.full(u.shape[1], 0.5), (0.03, 20.0), 2.5)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        fitted = GaussianProcessRegressor(kernel, alpha=_NUGGET_OVER).fit(u, scaled).kernel_
-    return np.asarray(np.atleast_1d(fitted.k2.length_scale) * np.ones(u.shape[1]))
+    kernel = ConstantKernel(1.0, (1e-1, 1e5)) * Matern(np.full(u.shape[1], 0.5), NODE_LENGTHS, 2.5)
+    found = fitted_kernel(kernel, u, scaled, NUGGETS_OVER[-1])
+    return np.asarray(np.atleast_1d(found.k2.length_scale) * np.ones(u.shape[1]))

@@ -14,7 +14,7 @@ from markupsafe import Markup
 
 from calib.data.reader import said_of
 from calib.models import BoundModel
-from calib.models.latex import html
+from calib.models.card import mathml
 from calib.report.figures.plate import Plate
 from calib.report.labels import MINUS, joined, percent, plain, short, unbroken
 from calib.report.numbers import (
@@ -108,7 +108,7 @@ def picture(plate: Plate, image: bytes, caption: str) -> dict[str, Any]:
 def equation(bound: BoundModel) -> Markup:
     """Return the equation of a model."""
     model = bound.model
-    written = Markup(", ").join(Markup(html(part)) for part in model.latex)
+    written = Markup(", ").join(Markup(mathml(part)) for part in model.latex)
     number = model.numbers.replace("-", "\N{EN DASH}")
     mark = Markup(" <span class='eq'>({})</span>").format(number) if number else ""
     return Markup("{}{}").format(written, mark)

@@ -15,7 +15,7 @@ from calib.batch.campaign.kinds import KINDS
 from calib.errors import CalibError
 from calib.inference.prior_files import default_priors
 from calib.models import MODELS
-from calib.models.simulators.registered import SIMULATED
+from calib.models.simulators.declaration import SIMULATED
 from tests.batch.campaign.sites import EFFECT, NAMES, WIND, make_site
 from tests.models.simulators.examples import PRIORS, pull
 

@@ -17,9 +17,8 @@ from calib.inference.emulation import foreseen
 from calib.inference.emulation.prepared import prepare, write_failed
 from calib.inference.emulation.state import EmulationSettings, State
 from calib.models import MODELS
-from calib.models.simulators.base import Failure
-from calib.models.simulators.registered import SIMULATED, Simulated
-from calib.models.simulators.runs import Run, RunKeeper
+from calib.models.simulators.declaration import SIMULATED, Simulated
+from calib.models.simulators.simulator import Failure, Run, RunKeeper
 from tests.models.simulators.examples import PRIORS, lab, pull
 from tests.registered import forgotten
 

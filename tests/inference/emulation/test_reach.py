@@ -15,7 +15,7 @@ import calib
 from calib.errors import CalibError
 from calib.inference.prior_files import default_priors
 from calib.models import MODELS, get_model
-from calib.models.simulators.registered import SIMULATED, written
+from calib.models.simulators.declaration import SIMULATED, written
 from tests.inference.emulation.test_emulate import CONDITIONS, declared, table
 from tests.models.simulators.examples import PRIORS, pull
 from tests.registered import forgotten

@@ -13,6 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
+from calib.models.simulators.simulator import Output, Runner, Simulator
+
 PRIORS = """
 [parameters.mu]
 dist = "lognormal"
@@ -51,6 +53,27 @@ json.dump({{"pull": pull}}, open(sys.argv[2], "w"))
 def pull(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
     """Return the pull (kN), shape (k, n)."""
     return theta[:, :1] * x["normal_load_kn"] * (1.0 - np.exp(-x["slip_ratio"] / theta[:, 1:2]))
+
+
+X = {"slip_ratio": np.array([0.1, 0.3]), "normal_load_kn": np.array([4.0, 5.0])}
+THETA = np.array([0.6, 0.08])
+EXACT = pull(THETA[None], X)[0]
+
+
+def simulator(runner: Runner, **changes: object) -> Simulator:
+    """Return a wheel that takes percent and gives newtons."""
+    given = {
+        "name": "wheel", "runner": runner, "parameters": ("mu", "s0"), "priors": "",
+        "conditions": {"s": "slip_percent", "w": "normal_load_kn"},
+        "outputs": (Output("drawbar_pull_n", "pull", ""),), "retries": 0,
+    } | changes  # fmt: skip
+    return Simulator(**given)  # type: ignore[arg-type]
+
+
+def in_percent(theta: np.ndarray, x: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the pull as that wheel does."""
+    own = {"slip_ratio": x["s"] / 100.0, "normal_load_kn": x["w"]}
+    return {"pull": 1000.0 * pull(theta, own)}
 
 
 def lab(rng: np.random.Generator, noise: float = 0.03) -> dict[str, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Emulators: where they stand, how sure they are, and where there is nothing."""
+"""Emulators and their processes: what they meet, how sure they are, where there is nothing."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from scipy.stats import qmc
 
 import calib
 from calib.errors import CalibError
+from calib.models.constants import BEYOND_NODES
 from calib.models.simulators.emulator import (
     Axes,
     Emulator,
@@ -20,7 +21,15 @@ from calib.models.simulators.emulator import (
     load_emulator,
     save_emulator,
 )
-from calib.models.simulators.kriging import Region
+from calib.models.simulators.kriging import (
+    Region,
+    Scales,
+    correlation,
+    find_scales,
+    krige,
+    over_conditions,
+    trend_of,
+)
 from tests.models.simulators.examples import lab, pull
 
 AXES = Axes(np.array([True, True]), np.log([0.5, 0.1]), np.array([0.4, 0.8]))
@@ -129,3 +138,87 @@ def test_it_is_the_same_from_disk(tmp_path: Path) -> None:
     (tmp_path / "wheel.npz").write_bytes(b"PK not a zip")
     with pytest.raises(CalibError, match="cannot be read"):
         load_emulator(tmp_path / "wheel.npz")
+
+
+def test_it_is_the_limit_of_a_wide_prior_of_the_trend() -> None:
+    rng = np.random.default_rng(1)
+    x, at = rng.standard_normal((40, 2)), rng.standard_normal((7, 2))
+    y = np.stack([np.sin(x[:, 0]) + x[:, 1] ** 2, x[:, 0] * x[:, 1]], axis=1)
+    scales = Scales(np.array([1.3, 2.1]), 1e-4)
+    found = krige(x, y, scales)
+    mean, unknown = found.mean_and_unknown(at)
+    b, b_at, wide = trend_of(x), trend_of(at), 1e6
+
+    def covariance(u: np.ndarray, v: np.ndarray, bu: np.ndarray, bv: np.ndarray) -> np.ndarray:
+        return correlation(u, v, scales.lengths) + wide * bu @ bv.T
+
+    k = covariance(x, x, b, b) + scales.nugget * np.eye(len(x))
+    across = covariance(at, x, b_at, b)
+    solved = np.linalg.solve(k, across.T)
+    left = np.diag(covariance(at, at, b_at, b_at)) - np.einsum("kn,nk->k", across, solved)
+    np.testing.assert_allclose(mean, solved.T @ y, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(unknown, left, rtol=0.02, atol=1e-4)
+    np.testing.assert_allclose(mean, found.mean(at))
+
+
+@pytest.mark.parametrize("noise", [0.05, 0.2])
+def test_noise_is_told_from_shape(noise: float) -> None:
+    rng = np.random.default_rng(3)
+    x = np.repeat(rng.uniform(-2.0, 2.0, (40, 1)), 3, axis=0)
+    y = np.sin(2.0 * x) + noise * rng.standard_normal(x.shape)
+    scales = find_scales(x, y, noisy=True)
+    found = krige(x, y, scales)
+    at = np.linspace(-1.5, 1.5, 21)[:, None]
+    assert np.sqrt(np.mean((found.mean(at) - np.sin(2.0 * at)) ** 2)) < 0.5 * noise
+    assert noise / 2.0 < np.sqrt(found.variances[0] * scales.nugget) < 2.0 * noise
+
+
+def test_a_constant_is_no_trouble() -> None:
+    x = np.random.default_rng(4).standard_normal((12, 3))
+    y = np.full((12, 2), 5.0)
+    found = krige(x, y, find_scales(x, y))
+    np.testing.assert_allclose(found.mean(x + 0.3), 5.0)
+
+
+def curves(s: np.ndarray, w: np.ndarray) -> np.ndarray:
+    return np.stack([w * (1.0 - np.exp(-s / 0.1)), w**1.2 * s, np.ones_like(s)])
+
+
+def grid(n: int) -> dict[str, np.ndarray]:
+    s, w = np.meshgrid(np.linspace(0.0, 0.6, n), np.linspace(2.0, 8.0, 6), indexing="ij")
+    return {"slip_ratio": s.ravel(), "normal_load_kn": w.ravel()}
+
+
+def test_curves_are_met_at_the_nodes_and_near_between() -> None:
+    nodes = grid(14)
+    known = curves(*nodes.values())
+    over = over_conditions(nodes, known)
+    weights = over.weights(known)
+    np.testing.assert_allclose(over.at(nodes, weights), known.T, atol=1e-4)
+    rng = np.random.default_rng(1)
+    x = {"slip_ratio": rng.uniform(0.0, 0.6, 50), "normal_load_kn": rng.uniform(2.0, 8.0, 50)}
+    true = curves(*x.values())
+    np.testing.assert_allclose(over.at(x, weights), true.T, atol=0.02 * 8.0)
+    # What is left out tells how far off it is between nodes, to a factor.
+    assert 0.0 < np.abs(over.left_out(known)).max() < 1.0
+
+
+def test_beyond_the_box_it_goes_on_straight_and_then_has_no_value() -> None:
+    nodes = {"slip_ratio": np.linspace(0.1, 0.5, 12)}
+    known = (2.0 + 3.0 * nodes["slip_ratio"])[None]
+    over = over_conditions(nodes, known)
+    weights = over.weights(known)
+    near, far = 0.5 + 0.9 * BEYOND_NODES * 0.4, 0.5 + 1.2 * BEYOND_NODES * 0.4
+    found = over.at({"slip_ratio": np.array([0.45, near, far])}, weights)[:, 0]
+    np.testing.assert_allclose(found[:2], [3.35, 2.0 + 3.0 * near], atol=2e-3)
+    assert np.isnan(found[2])
+
+
+def test_a_condition_that_did_not_vary_is_not_guessed() -> None:
+    nodes = {"slip_ratio": np.linspace(0.1, 0.5, 8), "normal_load_kn": np.full(8, 5.0)}
+    over = over_conditions(nodes, np.sin(nodes["slip_ratio"])[None])
+    weights = over.weights(np.sin(nodes["slip_ratio"])[None])
+    x = {"slip_ratio": np.array([0.2, 0.2]), "normal_load_kn": np.array([5.0, 6.0])}
+    found = over.at(x, weights)[:, 0]
+    assert np.isfinite(found[0])
+    assert np.isnan(found[1])

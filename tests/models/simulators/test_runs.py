@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from calib.errors import CalibError
-from calib.models.simulators.base import Output, Simulator
-from calib.models.simulators.runs import RunKeeper
-from calib.models.simulators.ways import CallableWay
+from calib.models.simulators.runner import CallableRunner
+from calib.models.simulators.simulator import Output, RunKeeper, Simulator
 
 X = {"slip_ratio": np.array([0.1, 0.3])}
 THETAS = np.array([[0.6], [0.7], [-1.0]])
@@ -27,7 +26,7 @@ def recorded(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
 
 def simulator(f: object = recorded) -> Simulator:
     return Simulator(
-        "line", CallableWay(f, ("pull",)), ("mu",), "",  # type: ignore[arg-type]
+        "line", CallableRunner(f, ("pull",)), ("mu",), "",  # type: ignore[arg-type]
         {"slip_ratio": "slip_ratio"}, (Output("drawbar_pull_kn", "pull", ""),), retries=0,
     )  # fmt: skip
 
@@ -84,11 +83,11 @@ def test_what_is_no_fault_of_the_parameters_is_not_kept(tmp_path: Path) -> None:
     def unplugged(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
         raise CalibError("the server is not there")
 
-    class Way(CallableWay):
+    class Runner(CallableRunner):
         def run(self, parameters: object, conditions: object) -> object:  # type: ignore[override]
             raise CalibError("the server is not there")
 
-    broken = replace(simulator(), way=Way(unplugged, ("pull",)))
+    broken = replace(simulator(), runner=Runner(unplugged, ("pull",)))
     with pytest.raises(CalibError, match=r"^3 of 3 runs could not be made: simulator line: the"):
         RunKeeper(broken, tmp_path).runs(THETAS, X)
     assert not list(tmp_path.rglob("*-0.json"))

@@ -263,7 +263,7 @@ def test_every_model_has_an_equation_and_a_parametrisation(name, tmp_path):
     example = tmp_path / "example.csv"
     example.write_text(example_csv(name))
     bound = MODELS[name].bind(read_table(example))
-    assert "<i>" in equation(bound)
+    assert "<mi>" in equation(bound)
     text = parametrisation(bound)
     assert "{" not in text
     assert ("must stay positive" in text) == (name == "magic_formula_pressure")

@@ -1,6 +1,7 @@
-"""Ways to carry out a simulator: an UM-Bridge server, a Python function, a program, a table.
+"""Runners of a simulator: a Python function, a program, an UM-Bridge server, a table of runs.
 
-And what is written for a program to read, and read of what it has written.
+A program is a child without a shell, in a process group of its own that ends with it, with a limit
+of time. And what is written for it to read, and read of what it has written.
 """
 
 from __future__ import annotations
@@ -9,10 +10,15 @@ import csv
 import io
 import json
 import os
+import pickle
 import re
 import shutil
+import signal
 import socket
+import subprocess
+import sys
 import tempfile
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,18 +31,197 @@ from urllib.parse import urlsplit
 from uuid import uuid4
 
 import numpy as np
+import psutil
 
-from calib.batch.user_code import call, content_of, declared_in, fingerprint
-from calib.data.files import read_text, real_array
+from calib.batch.folders import check_room
+from calib.batch.user_code import USER_MODULE, call, content_of, declared_in, fingerprint
+from calib.data.files import decoded, read_text, real_array
 from calib.errors import CalibError
 from calib.models.base import Array
-from calib.models.simulators.base import Failure, Given, Printed, no_output, not_made, tail
+from calib.models.constants import END_BYTES, KILL_SECONDS
 from calib.models.simulators.child import of_surroundings
-from calib.models.simulators.process import call_function, run_program
+from calib.models.simulators.simulator import Failure, Given, Printed, no_output, not_made, tail
+
+# A variable in the environment of a program and all that it starts.
+_MARK = "CALIB_RUN"
+# The environment variable with the folder of the simulator file.
+HOME = "CALIB_SIMULATOR"
+
+
+def run_program(
+    arguments: Sequence[str], folder: Path, limit: float, *, whole: bool = True, home: str = ""
+) -> Failure | str:
+    """Run a program in a folder, and return what it printed (the end of it, if not the `whole`).
+
+    It leads a process group, which is killed at its end, at the limit of seconds, and when this
+    process is interrupted; on Linux so is what has left the group, known by a variable of its
+    environment. A CalibError if it cannot be started, or if its surroundings and not its input have
+    ended it.
+    """
+    path = folder / ".printed"
+    mark = uuid4().hex
+    with path.open("wb") as printed:
+        try:
+            child = subprocess.Popen(
+                list(arguments), cwd=folder, stdin=subprocess.DEVNULL, stdout=printed,
+                stderr=subprocess.STDOUT, start_new_session=True,
+                env=os.environ | {_MARK: mark} | ({HOME: home} if home else {}),
+            )  # fmt: skip
+        except OSError as error:
+            why = _script(arguments[:1]) or error.strerror
+            raise not_made(
+                f"{arguments[0]} cannot be started ({why})", "make it a program that runs here"
+            ) from None
+        try:
+            code: int | None = child.wait(limit)
+        except subprocess.TimeoutExpired:
+            code = None
+        finally:
+            _end(child, mark)
+    if code is None:
+        return Failure("time", f"it took longer than {limit:g} s", tail(_text(path, whole=False)))
+    if code:
+        end = tail(_text(path, whole=False))
+        shells = ("sh", "bash", "dash", "ksh", "zsh", "env")
+        of_shell = code in _NOT_RUN or Path(arguments[0]).stem in shells
+        why = (_script(arguments) if of_shell else "") or _prevented(code, folder)
+        if why:
+            raise not_made(f"{_ended(code)}: {why}; it printed: {end.strip() or 'nothing'}")
+        return Failure("exit", _ended(code), end)
+    return _text(path, whole=whole)
+
+
+# Exit codes of a shell or `env` whose program is missing or cannot be run.
+_NOT_RUN = (126, 127)
+
+
+def _prevented(code: int, folder: Path) -> str:
+    """Return why a program was prevented from running, or an empty text."""
+    # Signals sent by a shell, a scheduler or a system without memory.
+    names = ("SIGKILL", "SIGTERM", "SIGHUP", "SIGINT", "SIGXFSZ")
+    killed = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    # A shell that runs it adds 128 to the signal.
+    if -code in killed or code - 128 in killed:
+        return "something else has ended it; where memory is short, the system does"
+    if code in _NOT_RUN:
+        return (
+            f"a program that it starts is not there or cannot be run; it runs in {folder}, made "
+            "for this run alone and removed after it, and finds its own files in the folder that "
+            f"the variable {HOME} names"
+        )
+    try:
+        check_room(folder)
+    except CalibError as error:
+        return error.message
+    return ""
+
+
+def _script(paths: Sequence[str]) -> str:
+    """Say which script cannot run on this system, and why."""
+    for path in filter(os.path.isfile, paths):
+        with Path(path).open("rb") as file:
+            head = file.readline(END_BYTES)
+        if head.endswith(b"\r\n"):
+            return (
+                f"the lines of {path} end as on Windows (CR LF), and the system takes the CR for a "
+                "part of a name: save it with the line ends of Unix"
+            )
+        words = head.removeprefix(b"#!").split()
+        if head.startswith(b"#!") and words and not os.path.exists(words[0]):  # noqa: PTH110
+            return f"the first line of {path} names {os.fsdecode(words[0])}, which is not there"
+    return ""
+
+
+def _text(path: Path, *, whole: bool) -> str:
+    """Return what a program printed, or the end of it."""
+    with path.open("rb") as printed:
+        if not whole:
+            printed.seek(max(path.stat().st_size - END_BYTES, 0))
+        return decoded(printed.read(), "replace")
+
+
+def call_function(function: Callable[..., Any], arguments: Sequence[Any], limit: float) -> Any:
+    """Call a Python function in a process of its own, which is ended when the limit has passed.
+
+    It is handed over with whatever it refers to; what it changes is lost. The limit in seconds
+    includes the start of the process. A CalibError if the function cannot be handed over.
+    """
+    with tempfile.TemporaryDirectory(prefix="calib-run-", ignore_cleanup_errors=True) as name:
+        scratch = Path(name)
+        given, taken = scratch / "call", scratch / "result"
+        given.write_bytes(
+            pickle.dumps((str(Path.cwd()), sys.path, _handed_over(function, arguments)))
+        )
+        child = Path(__file__).with_name("child.py")
+        started = [sys.executable, "-P", str(child), str(given), str(taken)]
+        printed = run_program(started, scratch, limit, whole=False)
+        if isinstance(printed, Failure):
+            return printed
+        found, raised, elsewhere = pickle.loads(taken.read_bytes())
+    if elsewhere:
+        raise not_made(raised)
+    return found if raised is None else Failure("error", raised, tail(printed))
+
+
+def _handed_over(function: Callable[..., Any], arguments: Sequence[Any]) -> bytes:
+    import cloudpickle
+
+    # Another process cannot import a file that was loaded by its path.
+    module = sys.modules.get(getattr(function, "__module__", ""))
+    by_path = module is not None and module.__name__.startswith(USER_MODULE)
+    try:
+        if by_path:
+            cloudpickle.register_pickle_by_value(module)
+        return bytes(cloudpickle.dumps((function, tuple(arguments))))
+    except (TypeError, pickle.PicklingError) as error:
+        raise CalibError(
+            f"the function cannot be handed to a process of its own ({error})",
+            where=getattr(function, "__qualname__", repr(function)),
+            hint="open files and connections inside it, or give no limit of time",
+        ) from None
+    finally:
+        if by_path:
+            cloudpickle.unregister_pickle_by_value(module)
+
+
+def _ended(code: int) -> str:
+    if code > 0:
+        return f"it ended with exit code {code}"
+    with suppress(ValueError):
+        return f"it was killed by the signal {signal.Signals(-code).name}"
+    return f"it was killed by the signal {-code}"
+
+
+def _end(child: subprocess.Popen[bytes], mark: str) -> None:
+    """Kill the child's group and what has left it, and reap the child."""
+    with suppress(ProcessLookupError, PermissionError):
+        if sys.platform == "win32":
+            child.kill()
+        else:
+            os.killpg(child.pid, signal.SIGKILL)
+    # A killed process may hang in the kernel.
+    with suppress(subprocess.TimeoutExpired):
+        child.wait(KILL_SECONDS)
+    # A killed process may have started another.
+    until = time.monotonic() + KILL_SECONDS
+    while (left := _marked(mark)) and time.monotonic() < until:
+        for process in left:
+            with suppress(psutil.Error):
+                process.kill()
+        time.sleep(0.01)
+
+
+def _marked(mark: str) -> list[psutil.Process]:
+    """Return the processes with a mark in their environment; not those of other users."""
+    running = psutil.process_iter(["environ"])
+    return [
+        one for one in running
+        if (one.info["environ"] or {}).get(_MARK) == mark
+    ]  # fmt: skip
 
 
 @dataclass(frozen=True)
-class UmbridgeWay:
+class UmbridgeRunner:
     """A model behind an UM-Bridge server (protocol 1.0, doi:10.21105/joss.04748).
 
     The client of the package `umbridge` has no limit of time and stops at a NaN in a reply, so the
@@ -77,12 +262,12 @@ class UmbridgeWay:
             if isinstance(reply, Failure):
                 return reply
             vectors = reply.get("output")
-            if not isinstance(vectors, list) or len(vectors) != len(self.columns):
-                given = len(vectors) if isinstance(vectors, list) else 0
-                what = f"the reply has {given} output vectors for {', '.join(self.columns)}"
-                return Failure("unreadable", what, tail(str(reply)))
-            if not all(isinstance(values, list) for values in vectors):
+            vectors, what = vectors if isinstance(vectors, list) else [], ""
+            if len(vectors) != len(self.columns):
+                what = f"the reply has {len(vectors)} output vectors for {', '.join(self.columns)}"
+            elif not all(isinstance(values, list) for values in vectors):
                 what = "the reply is not of output vectors of numbers"
+            if what:
                 return Failure("unreadable", what, tail(str(reply)))
             for name, values in zip(self.columns, vectors, strict=True):
                 outputs[name].append(values)
@@ -98,9 +283,10 @@ class UmbridgeWay:
             with urllib.request.urlopen(request, timeout=self.limit) as reply:
                 answer = reply.read()
         except urllib.error.HTTPError as error:
-            if error.code not in _OF_THE_MODEL:
+            if error.code not in (400, 500):  # of a refused call and of a failed model
                 raise self._not_there(f"{error.code} {error.reason}") from None
-            return Failure("error", f"the server answered {error.code}", tail(_body(error)))
+            said = tail(error.read().decode(errors="replace"))
+            return Failure("error", f"the server answered {error.code}", said)
         except (urllib.error.URLError, ValueError) as error:  # before anything was asked
             raise self._not_there(getattr(error, "reason", error)) from None
         except (OSError, HTTPException) as error:
@@ -133,16 +319,8 @@ class UmbridgeWay:
         return True
 
 
-# Codes of the protocol for a refused call and a failed model; others are not from the model.
-_OF_THE_MODEL = (400, 500)
-
-
-def _body(error: urllib.error.HTTPError) -> str:
-    return error.read().decode(errors="replace")
-
-
 @dataclass(frozen=True)
-class CallableWay:
+class CallableRunner:
     """A Python function, ``(theta, conditions) -> output``.
 
     Theta is (k, d), conditions (n,) by the simulator's own names; it returns (k, n), or a mapping
@@ -235,7 +413,7 @@ class CallableWay:
 
 
 @dataclass(frozen=True)
-class CommandWay:
+class CommandRunner:
     """A program, run without a shell in a scratch folder of its own.
 
     `arguments` have ``{input}`` and ``{output}`` for the paths of the two files; without
@@ -301,36 +479,27 @@ class CommandWay:
     ) -> Printed | Failure:
         with tempfile.TemporaryDirectory(prefix="calib-run-", ignore_cleanup_errors=True) as name:
             scratch = Path(name)
-            given, taken = scratch / f"input.{self._ending}", scratch / f"output.{self.gives}"
+            ending = "txt" if self.takes == "template" else self.takes
+            given, taken = scratch / f"input.{ending}", scratch / f"output.{self.gives}"
             given.write_text(self._input(parameters, conditions), encoding="utf-8")
             paths = {"{input}": str(given), "{output}": str(taken)}
-            whole = not self._leaves_file
+            leaves_file = any("{output}" in a for a in self.arguments)
             printed = run_program(
-                self._arguments(paths), scratch, self.limit, whole=whole, home=str(self.folder)
-            )
+                self._arguments(paths), scratch, self.limit, whole=not leaves_file,
+                home=str(self.folder),
+            )  # fmt: skip
             if isinstance(printed, Failure):
                 return printed
-            return self._read(taken, printed)
-
-    def _read(self, taken: Path, printed: str) -> Printed | Failure:
-        text = printed
-        if self._leaves_file:
-            try:
-                text = read_text(taken)
-            except (OSError, UnicodeDecodeError):
-                return Failure("unreadable", "it left no readable output file", tail(printed))
-        found = output_of_text(text, self.gives, self.patterns)
-        if isinstance(found, Failure):
-            return Failure(found.kind, found.reason, tail(printed))
-        return Printed(found, tail(printed))
-
-    @property
-    def _leaves_file(self) -> bool:
-        return any("{output}" in a for a in self.arguments)
-
-    @property
-    def _ending(self) -> str:
-        return "txt" if self.takes == "template" else self.takes
+            text, end = printed, tail(printed)
+            if leaves_file:
+                try:
+                    text = read_text(taken)
+                except (OSError, UnicodeDecodeError):
+                    return Failure("unreadable", "it left no readable output file", end)
+            found = output_of_text(text, self.gives, self.patterns)
+            if isinstance(found, Failure):
+                return Failure(found.kind, found.reason, end)
+            return Printed(found, end)
 
     def _arguments(self, paths: Mapping[str, str]) -> list[str]:
         written = []
@@ -348,7 +517,7 @@ class CommandWay:
 
 
 @dataclass(frozen=True)
-class TableWay:
+class TableRunner:
     """Runs that were made already: a CSV with a column for each parameter, condition and output.
 
     It has a row for each row of conditions of each run; `sha256` is that of the file.
@@ -370,9 +539,8 @@ class TableWay:
         return Failure("error", "there are the runs of the table and no others")
 
 
+# Where a value belongs in a template.
 _PLACE = re.compile(r"@([^\W\d]\w*)@")
-# The rest of a number that was cut off.
-_GOES_ON = re.compile(r"[.,]?\d+|[eEdD][-+]?\d+", re.ASCII)
 
 
 def input_json(parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> str:
@@ -479,8 +647,9 @@ def _matches(text: str, pattern: str) -> Array:
     found = list(re.finditer(pattern, text, re.M))
     group = 1 if found and found[0].re.groups else 0
     starts = {one.start(group) for one in found}
+    rest = re.compile(r"[.,]?\d+|[eEdD][-+]?\d+", re.ASCII)  # of a number that was cut off
     for one in found:
-        more = _GOES_ON.match(text, one.end(group))
+        more = rest.match(text, one.end(group))
         if more and starts.isdisjoint(range(one.end(group), more.end() + 1)):
             raise ValueError(f"{one[group]!r} is the beginning of {one[group] + more[0]!r} only")
     return real_array([one[group] for one in found])

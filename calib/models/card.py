@@ -1,0 +1,197 @@
+r"""Model cards: what is said of the models, as data in `calib/models/cards`.
+
+A file holds the cards of one module. What stands before its first model holds for all its models:
+their own keys come first, and lists and tables are continued by it.
+
+Equations are written once, in LaTeX, and read as plain text and as MathML.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Callable, Iterable
+from html import escape
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+from unicodedata import normalize
+from xml.etree import ElementTree
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from calib.models.base import (
+    Alone,
+    Array,
+    Conditions,
+    Model,
+    Parameters,
+    as_they_are,
+    no_references,
+)
+
+
+class Equation(NamedTuple):
+    """The functions of a `Model`."""
+
+    mean_response: Callable[..., Array]
+    to_reported: Callable[..., Parameters] = as_they_are
+    from_reported: Callable[..., Parameters] = as_they_are
+    bind_references: Callable[[Conditions], dict[str, float]] = no_references
+
+
+class Published(BaseModel):
+    """A parameter as it is published; its meaning is left out where it is sampled as it is."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    unit: str
+    meaning: str = ""
+
+
+class Card(BaseModel):
+    """What is said of a model; all but `symbols` are fields of `Model` or parts of them.
+
+    Parameters
+    ----------
+    parameters : dict of str to str
+        Meaning of each sampled parameter, in the order of `theta`.
+    symbols : dict of str to str
+        Meaning and unit of the other letters of the equation; those after a dollar are set as
+        mathematics.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    title: str
+    output: str
+    conditions: tuple[str, ...] = Field(min_length=1)
+    parameters: dict[str, str] = Field(min_length=1)
+    reported: dict[str, Published] = {}
+    response: Literal["identity", "log"] = "identity"
+    equation: tuple[str, ...] = Field(min_length=1)
+    symbols: dict[str, str] = Field(min_length=1)
+    numbers: str = ""
+    source: str = Field(min_length=1)
+    cited: str = ""
+    applies: str = Field(pattern=r"\.$")
+    parametrisation: str = "The parameters of the equation are sampled."
+    parabolic_in: str = ""
+    estimates_all_rows: bool = False
+    alone: Alone | None = None
+    searched: dict[str, tuple[float, float]] = {}
+    joined: tuple[str, str, str] | None = None
+    slow: bool = False
+
+    def model(self, name: str, equation: Equation) -> Model:
+        """Return the model of this card and its equation."""
+        published = {p: said.meaning for p, said in self.reported.items() if said.meaning}
+        letters = [
+            f"[{symbol}] the {words}" if symbol.startswith("$") else f"{symbol} the {words}"
+            for symbol, words in self.symbols.items()
+        ]
+        apart = {"parameters", "reported", "equation", "symbols"}
+        return Model(
+            name=name,
+            parameters=tuple(self.parameters),
+            reported={p: said.unit for p, said in self.reported.items()},
+            meanings=self.parameters | published,
+            latex=self.equation,
+            letters=", ".join(letters),
+            **{key: getattr(self, key) for key in type(self).model_fields if key not in apart},
+            **equation._asdict(),
+        )
+
+
+def from_cards(module: str, **equations: Equation) -> tuple[Model, ...]:
+    """Return the models of a module by the cards in its file, in the order of the equations."""
+    path = Path(__file__).parent / "cards" / f"{module}.toml"
+    shared = tomllib.loads(path.read_text(encoding="utf-8"))
+    models: dict[str, dict[str, Any]] = shared.pop("models")
+    return tuple(
+        Card.model_validate(_continued(models[name], shared)).model(name, equation)
+        for name, equation in equations.items()
+    )
+
+
+def _continued(own: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:
+    found = shared | own
+    for key in own.keys() & shared.keys():
+        if isinstance(own[key], list):
+            found[key] = own[key] + shared[key]
+        elif isinstance(own[key], dict):
+            found[key] = own[key] | shared[key]
+    return found
+
+
+# HTML needs none.
+_NAMESPACE = ' xmlns="http://www.w3.org/1998/Math/MathML"'
+_FUNCTION = r"\\(?:sin|cos|tan|arctan|exp|ln|log|max|min)\b"
+
+
+def mathml(latex: str) -> str:
+    """Return words with mathematics between dollars as HTML with MathML."""
+    parts = latex.split("$")
+    return "".join(formula(part) if i % 2 else escape(part) for i, part in enumerate(parts))
+
+
+def formula(latex: str, display: Literal["inline", "block"] = "inline") -> str:
+    """Return mathematics as MathML, which browsers draw without script, font or request."""
+    from latex2mathml.converter import convert  # late: a tenth of a second
+
+    # Browsers do not set functions off from the letters beside them.
+    latex = re.sub(rf"(?<=[\w)\]}}])\s*(?={_FUNCTION})", r"\\,", latex)
+    spaced = re.sub(rf"({_FUNCTION})\s*(?=[A-Za-z\\])", r"\1\\,", latex)
+    return str(convert(spaced, display=display)).replace(_NAMESPACE, "")
+
+
+def text(latex: str) -> str:
+    """Return words with mathematics between dollars as plain text."""
+    parts = latex.split("$")
+    return "".join(_plain(formula(part)) if i % 2 else part for i, part in enumerate(parts))
+
+
+def _plain(mathml: str) -> str:
+    """Write MathML as plain text."""
+    return normalize("NFKC", _row(ElementTree.fromstring(mathml))).replace("\N{MINUS SIGN}", "-")
+
+
+def _row(nodes: Iterable[ElementTree.Element]) -> str:
+    """Write parts side by side, spaces about operators and between letters."""
+    row, upright = "", False
+    for node in nodes:
+        part = _part(node)
+        if node.tag == "mo" and part in _OPERATORS and row and row[-1] not in "([{/ ":
+            part = f" {part} "
+        elif row and _ends_word(row) and _begins_word(part):
+            part = part if upright and node.get("mathvariant") == "normal" else f" {part}"
+        row, upright = row + part, node.get("mathvariant") == "normal"
+    return row
+
+
+_OPERATORS = frozenset("=+\N{MINUS SIGN}\N{MIDDLE DOT}\N{MULTIPLICATION SIGN}\u2264\u2265<>")
+
+
+def _ends_word(row: str) -> bool:
+    return row[-1].isalnum() or row[-1] in ")]}\u222b"
+
+
+def _begins_word(part: str) -> bool:
+    return part[:1].isalnum() or part[:1] in ("\u221a", "\u222b", "\u2202", "\u221e")
+
+
+def _part(node: ElementTree.Element) -> str:
+    parts = [_row([child]) for child in node]
+    match node.tag:
+        case "msub":
+            return "{}_{}".format(*parts)
+        case "msup":
+            return parts[0] + _raised(parts[1])
+        case "msubsup":
+            return "{}_{}".format(*parts) + _raised(parts[2])
+        case "mfrac":
+            return "({})/({})".format(*parts)
+        case "msqrt":
+            return f"\u221a({_row(node)})"
+    return _row(node) if len(node) else (node.text or "").strip()
+
+
+def _raised(part: str) -> str:
+    return f"^{part}" if len(part) == 1 else f"^({part})"
