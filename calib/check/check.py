@@ -61,8 +61,7 @@ from calib.report.comparison import (
 from calib.report.document import summarise_estimates
 from calib.report.publish import publication
 from calib.report.sections import SECTIONS, work_out
-from calib.report.study import Progress, Study, estimate_task
-from calib.report.study_tasks import Task, fitted_rows
+from calib.report.study import Progress, Study, Task, estimate_task, fitted_rows
 from calib.report.writer import write_report
 from calib.validation.comparison import stacking_weights
 from calib.validation.validate import Place

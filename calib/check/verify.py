@@ -42,7 +42,7 @@ from calib.inference.prior_files import default_priors
 from calib.report.comparison import FOLDER as COMPARED
 from calib.report.comparison import ComparisonRecord
 from calib.report.sections import SECTIONS
-from calib.report.study_tasks import HoldOut
+from calib.report.study import HoldOut
 
 MANIFEST, SUMMARY, AUDIT = "manifest.json", "summary.json", "audit.json"
 

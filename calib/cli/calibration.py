@@ -66,7 +66,7 @@ def report(
     from calib.data.quantities import OUTPUTS
     from calib.inference.prior_files import prior_file_model
     from calib.report.sections import EmulatorSection, work_out
-    from calib.report.study_tasks import HoldOut, fitted_rows, plan_tasks
+    from calib.report.study import HoldOut, fitted_rows, plan_tasks
     from calib.report.verdict import judge_evidence
     from calib.report.writer import write_report
 
@@ -161,8 +161,8 @@ def fit(
     from calib.inference.random import generator
     from calib.models import get_model
     from calib.report.numbers import format_number
-    from calib.report.study_tasks import HoldOut, read_and_split
-    from calib.report.verdict import keep_verdict, validated, verdict
+    from calib.report.study import HoldOut, read_and_split, validated
+    from calib.report.verdict import keep_verdict, verdict
     from calib.validation.comparison import noise_preference
     from calib.validation.validate import PARETO_K_MAX
 
@@ -243,7 +243,7 @@ def compare(
     from calib.inference.sampler import SamplerSettings
     from calib.models import get_model
     from calib.report.comparison import text, write_comparison
-    from calib.report.study_tasks import HoldOut, read_and_split
+    from calib.report.study import HoldOut, read_and_split
     from calib.validation.comparison import check_comparable
     from calib.validation.comparison import compare as compare_models
 

@@ -46,8 +46,7 @@ from calib.report.labels import aligned, axis_of, units_of
 from calib.report.numbers import finite, format_number
 from calib.report.page.template import data_uri, template
 from calib.report.sections import Section, Target
-from calib.report.study import Progress, Study
-from calib.report.study_tasks import Task, fitted_rows
+from calib.report.study import Progress, Study, Task, fitted_rows
 from calib.report.verdict import Verdict, keep_verdict, kept_verdict, verdict
 from calib.report.writer import file_hashes, own_names
 from calib.validation.comparison import (
@@ -62,16 +61,13 @@ from calib.validation.comparison import (
 from calib.validation.prediction import N_DRAWS
 from calib.validation.validate import PARETO_K_MAX
 
-_LEVEL = 0.9
-_MOST_COLUMNS = 3
-
 
 def comparison_figure(comparison: Comparison) -> Figure:
     """Draw, for each model, measured rows and the 90 % interval it gives each without it."""
     candidates = comparison.candidates
     column = _main_condition(comparison)
     x, y = axis_of(column), axis_of(candidates[0].calibration.problem.bound.model.output)
-    cols = min(_MOST_COLUMNS, len(candidates))
+    cols = min(3, len(candidates))
     rows = -(-len(candidates) // cols)
     with style():
         figure, axes = panels(
@@ -82,8 +78,7 @@ def comparison_figure(comparison: Comparison) -> Figure:
             table = candidate.loo.table
             place = _spread(x.factor * table[column])
             low, middle, high = (
-                y.factor * np.quantile(candidate.loo.draws, q, axis=0)
-                for q in (0.5 - _LEVEL / 2.0, 0.5, 0.5 + _LEVEL / 2.0)
+                y.factor * np.quantile(candidate.loo.draws, q, axis=0) for q in (0.05, 0.5, 0.95)
             )
             bars = ax.vlines(place, low, high, color=BLUE, alpha=0.35, linewidth=1.6)
             dash = ax.plot(place, middle, "_", color=BLUE, markersize=4.0)[0]
@@ -123,15 +118,6 @@ def _spread(x: Array) -> Array:
     return moved
 
 
-_HEAD = (
-    "Model", "Below the best, elpd", "Standard error", "Stacking weight", "RMSE ({unit})",
-    "90 % covers", "Rows fitted again", "Log evidence",
-)  # fmt: skip
-_HELD_HEAD = (
-    "held-out elpd", "held-out RMSE ({unit})", "held-out CRPS ({unit})", "held-out 90 % covers",
-)  # fmt: skip
-
-
 def table(found: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
     """Return head and rows of the table, from the content of `comparison.json`.
 
@@ -140,27 +126,31 @@ def table(found: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
     models = found["models"]
     with units_of(found.get("header", ())):
         axis = axis_of(get_model(next(iter(models))).output)
-    head = [*_HEAD, *(_HELD_HEAD if found["held_out"] else ())]
-    return (
-        [cell.format(unit=axis.unit) for cell in head],
-        [_row(name, m, axis.factor) for name, m in models.items()],
-    )
 
+    def shown(value: float | None, factor: float | None = None) -> str:
+        if value is None:
+            return "none"
+        return f"{value:.1f}" if factor is None else format_number(factor * value)
 
-def _row(name: str, m: Mapping[str, Any], factor: float) -> list[str]:
-    cells = [
-        name, f"{m['below_best']:.1f}", f"{m['below_best_se']:.1f}", f"{m['weight']:.2f}",
-        format_number(factor * m["rmse"]), f"{100 * m['coverage_90']:.0f} %",
-        str(m["refitted_rows"]),
-        "none" if m["log_evidence"] is None else f"{m['log_evidence']:.1f}",
-    ]  # fmt: skip
-    held = m.get("held_out")
-    if held:
-        density = "none" if held["elpd"] is None else f"{held['elpd']:.1f}"
-        crps = "none" if held["crps"] is None else format_number(factor * held["crps"])
-        cells += [density, format_number(factor * held["rmse"]), crps,
-                  f"{100 * held['coverage_90']:.0f} %"]  # fmt: skip
-    return cells
+    rows = []
+    for name, m in models.items():
+        row = {
+            "Model": name, "Below the best, elpd": shown(m["below_best"]),
+            "Standard error": shown(m["below_best_se"]),
+            "Stacking weight": f"{m['weight']:.2f}",
+            f"RMSE ({axis.unit})": shown(m["rmse"], axis.factor),
+            "90 % covers": f"{100 * m['coverage_90']:.0f} %",
+            "Rows fitted again": str(m["refitted_rows"]), "Log evidence": shown(m["log_evidence"]),
+        }  # fmt: skip
+        if found["held_out"] and (held := m.get("held_out")):
+            row |= {
+                "held-out elpd": shown(held["elpd"]),
+                f"held-out RMSE ({axis.unit})": shown(held["rmse"], axis.factor),
+                f"held-out CRPS ({axis.unit})": shown(held["crps"], axis.factor),
+                "held-out 90 % covers": f"{100 * held['coverage_90']:.0f} %",
+            }
+        rows.append(row)
+    return list(rows[0]), [list(row.values()) for row in rows]
 
 
 def text(found: Mapping[str, Any]) -> str:

@@ -21,8 +21,7 @@ from calib.report.labels import Axis, axis_of, units_of
 from calib.report.numbers import finite
 from calib.report.reference import Reference, reference_of
 from calib.report.rows import held_table, x_column
-from calib.report.study import OutputResult, Study
-from calib.report.study_tasks import HoldOut
+from calib.report.study import HoldOut, OutputResult, Study
 from calib.report.verdict import judge_evidence
 from calib.validation.comparison import NoisePreference
 from calib.validation.scores import CONTRACTION_MIN, SENSITIVITY_MIN, Scores, role

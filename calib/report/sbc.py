@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
 from calib.batch.folders import write_whole
-from calib.models import get_model
+from calib.models import MODELS
 from calib.report.figures.style import (
     BLACK,
     BLUE,
@@ -34,19 +34,12 @@ from calib.report.numbers import finite
 from calib.report.page.template import data_uri, template
 from calib.validation.sbc import LEVEL, ModelScore, Quantity, SbcScore, ecdf_band
 
-# Of the simultaneous band drawn in each panel.
-BAND = 0.95
-_FOOT = 18.0  # mm below the panels
+SCHEMA = "calib/sbc/1"
 _TITLES: Mapping[str, str] = {
     "log_likelihood": "log likelihood",
     "prediction": "held-out mean",
     "measurement": "held-out reading",
 }
-
-
-def title_of(quantity: str) -> str:
-    """Return what a quantity is called on a figure."""
-    return _TITLES.get(quantity) or symbol(quantity)
 
 
 def ranks_figure(model: ModelScore, adjusted: Mapping[tuple[str, str], float]) -> Figure:
@@ -62,7 +55,7 @@ def ranks_figure(model: ModelScore, adjusted: Mapping[tuple[str, str], float]) -
     rows = -(-n // cols)
     with style():
         figure, axes = panels(
-            rows, cols, height=22.0, left=17.0, right=4.0, top=6.0, bottom=_FOOT, gap_x=4.0,
+            rows, cols, height=22.0, left=17.0, right=4.0, top=6.0, bottom=18.0, gap_x=4.0,
             gap_y=10.0, sharex=True, sharey=True,
         )  # fmt: skip
         handles: dict[str, Any] = {}
@@ -73,16 +66,15 @@ def ranks_figure(model: ModelScore, adjusted: Mapping[tuple[str, str], float]) -
         for row in axes:
             row[0].set_ylabel(f"ECDF {MINUS} PIT")
         height = figure.get_size_inches()[1] * 25.4
-        figure.supxlabel(
-            "probability integral transform (PIT) of the truth", fontsize=8, y=0.45 * _FOOT / height
-        )
+        what = "probability integral transform (PIT) of the truth"
+        figure.supxlabel(what, fontsize=8, y=8.0 / height)
         legend_below(figure, handles, 3)
     return figure
 
 
 def _panel(ax: Axes, quantity: Quantity, *, alarm: bool) -> dict[str, Any]:
-    band = ecdf_band(quantity.pit, BAND)
-    label = f"{100 * BAND:g} % simultaneous band if calibrated"
+    band = ecdf_band(quantity.pit, 0.95)
+    label = "95 % simultaneous band if calibrated"
     colour = VERMILION if alarm else BLUE
     handles: dict[str, Any] = {
         label: ax.fill_between(
@@ -92,7 +84,7 @@ def _panel(ax: Axes, quantity: Quantity, *, alarm: bool) -> dict[str, Any]:
     }  # fmt: skip
     (handles["observed"],) = ax.step(band.x, band.ecdf - band.x, where="post", color=colour, lw=1.0)
     ax.axhline(0.0, color=GREY, lw=0.5)
-    ax.set_title(title_of(quantity.name), fontsize=7.0)
+    ax.set_title(_TITLES.get(quantity.name) or symbol(quantity.name), fontsize=7.0)
     half = 1.7 * float(max((band.upper - band.x).max(), abs(band.ecdf - band.x).max() / 1.4))
     ax.set_ylim(min(-half, ax.get_ylim()[0]), max(half, ax.get_ylim()[1]))
     words = f"p = {short(quantity.p)}" + (" !" if alarm else "")
@@ -151,13 +143,12 @@ def render(score: SbcScore, images: Mapping[str, str], command: Sequence[str]) -
     """Render the page of a run; data URIs of its figures by model, and ``coverage``."""
     return template("sbc.html.j2").render(
         verdict=verdict(score),
-        fine=not score.alarms,
-        seed=score.seed,
-        simulations=score.simulations,
-        models=[_section(m, score, images) for m in score.models],
+        score=score,
+        known=MODELS,
+        worst={m.model: min(m.quantities, key=lambda q: q.p) for m in score.models},
         rows=[_row(m) for m in score.models],
         head=_HEAD,
-        coverage=images["coverage"],
+        images=images,
         command=shlex.join(command),
     )
 
@@ -180,33 +171,9 @@ def _row(m: ModelScore) -> list[str]:
     ]  # fmt: skip
 
 
-def _section(m: ModelScore, score: SbcScore, images: Mapping[str, str]) -> dict[str, Any]:
-    worst = min(m.quantities, key=lambda q: q.p)
-    return {
-        "name": m.model,
-        "title": get_model(m.model).title,
-        "design": m.design,
-        "image": images[m.model],
-        "replicates": m.replicates,
-        "unconverged": m.unconverged,
-        "extended": m.extended,
-        "redrawn": m.attempts - m.replicates,
-        "no_band": m.no_band,
-        "failed": dict(m.failed),
-        "quantities": len(m.quantities),
-        "worst": worst.name,
-        "worst_p": short(worst.p),
-        "worst_all": short(min(q.p_all for q in m.quantities)),
-        "alarms": [name for model, name in score.alarms if model == m.model],
-    }
-
-
 def text_table(score: SbcScore) -> str:
     """Lay a run out as text."""
     return "\n".join([*aligned([_HEAD, *(_row(m) for m in score.models)]), verdict(score)])
-
-
-SCHEMA = "calib/sbc/1"
 
 
 def document(score: SbcScore, settings: dict[str, Any]) -> dict[str, Any]:

@@ -24,8 +24,7 @@ from calib.report.numbers import format_number
 # Every command loads what plug-ins declare here, and few work a report out.
 if TYPE_CHECKING:
     from calib.inference.sampler import SamplerSettings
-    from calib.report.study import Progress, Study
-    from calib.report.study_tasks import Task
+    from calib.report.study import Progress, Study, Task
 
 type Document = Mapping[str, Any]
 

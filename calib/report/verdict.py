@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 
-from calib.data import Table
 from calib.data.quantities import output_of, role_of
 from calib.inference.calibration import Calibration
 from calib.inference.io import RUN
@@ -31,7 +30,6 @@ from calib.models.base import Array
 from calib.report.labels import axis_of, joined, units_of
 from calib.report.page.template import words
 from calib.report.rows import Fitted, held_table, signs_along, x_column
-from calib.report.study_tasks import MAX_ROWS
 from calib.validation.assumptions import checks_of, remarks_of
 from calib.validation.prediction import (
     binomial_p,
@@ -42,7 +40,7 @@ from calib.validation.prediction import (
 )
 from calib.validation.residuals import LEVEL, Check, Range, Remark, failed
 from calib.validation.scores import MOVED, PRIOR, role, standardise
-from calib.validation.validate import Validation, leave_one_out, validate_held_out
+from calib.validation.validate import Validation
 
 
 class Where(StrEnum):
@@ -321,19 +319,6 @@ def verdict(
         return found
     at = f" ({held_out})" if held_out else ""
     return replace(found, held_out=f"{len(held)} rows{at}")
-
-
-def validated(calibration: Calibration, held: Table | None) -> Validation | None:
-    """Score a calibration on rows held out, or on each left out in turn; None where neither can be.
-
-    Rows are left out by weights alone, for to fit without each takes as long as all else. Of a
-    posterior that did not converge, or of more rows than a report takes, none is.
-    """
-    if held is not None:
-        return validate_held_out(calibration, held)
-    if not calibration.converged or len(calibration.problem.table) > MAX_ROWS:
-        return None
-    return leave_one_out(calibration, refit=False)
 
 
 def keep_verdict(found: Verdict, folder: Path) -> None:

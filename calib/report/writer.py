@@ -26,8 +26,7 @@ from calib.report.figures.collect import draw
 from calib.report.page.content import render_page
 from calib.report.publish import publication
 from calib.report.sections import Report, Target
-from calib.report.study import OutputResult, Progress, Study
-from calib.report.study_tasks import Task
+from calib.report.study import OutputResult, Progress, Study, Task
 
 SCHEMA = "calib/manifest/2"
 

@@ -34,8 +34,7 @@ from calib.report.figures.posterior import learned_plate
 from calib.report.figures.style import style
 from calib.report.reference import NOTHING, Reference
 from calib.report.sections import Report, work_out
-from calib.report.study import OutputResult
-from calib.report.study_tasks import Task
+from calib.report.study import OutputResult, Task
 from calib.report.writer import write_report
 from calib.validation.comparison import compare
 from tests.check.kernels import Setting, skip_what_crashes

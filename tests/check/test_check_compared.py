@@ -18,7 +18,7 @@ from calib.errors import CalibError
 from calib.models import example_csv
 from calib.report.comparison import StatedComparison, plan_comparison
 from calib.report.sections import work_out
-from calib.report.study_tasks import HoldOut, plan_tasks
+from calib.report.study import HoldOut, plan_tasks
 from calib.report.writer import file_hashes
 from tests.check.conftest import edit_json
 

@@ -26,7 +26,7 @@ from calib.he2019.sections import AuditSection, GapsSection
 from calib.inference.sampler import SamplerSettings
 from calib.report.document import summarise
 from calib.report.sections import work_out
-from calib.report.study_tasks import Task
+from calib.report.study import Task
 from calib.report.writer import file_hashes, write_report
 from calib.validation.sbc import run_sbc
 

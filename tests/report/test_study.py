@@ -22,8 +22,7 @@ from calib.inference.prior_files import default_priors
 from calib.inference.sampler import SamplerSettings
 from calib.report.document import summarise
 from calib.report.sections import Report, work_out
-from calib.report.study import Failure, OutputResult, Study
-from calib.report.study_tasks import Task, plan_tasks
+from calib.report.study import Failure, OutputResult, Study, Task, plan_tasks
 from calib.report.writer import build_manifest, file_hashes
 from tests.user_tables import pulls, table
 

@@ -13,7 +13,7 @@ from calib.errors import CalibError
 from calib.he2019.designs import he2019_tasks
 from calib.he2019.embedded import load_he2019
 from calib.inference.prior_files import default_priors
-from calib.report.study_tasks import HoldOut, choose_model, plan_tasks
+from calib.report.study import HoldOut, choose_model, plan_tasks
 from tests.user_tables import pulls, table
 
 HELD = HoldOut("inflation_pressure_psi", 30.0)

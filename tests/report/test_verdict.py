@@ -12,6 +12,7 @@ import pytest
 from scipy.stats import binom
 
 import calib
+from calib.report.study import validated
 from calib.report.verdict import (
     Evidence,
     Level,
@@ -19,7 +20,6 @@ from calib.report.verdict import (
     Where,
     gather,
     judge_evidence,
-    validated,
 )
 from calib.validation.prediction import binomial_p
 from calib.validation.residuals import LEVEL, Check, Range, Remark

@@ -55,7 +55,7 @@ from calib.models import get_model
 from calib.models.simulators.declaration import slow_simulator
 from calib.models.simulators.emulator import emulator_of, save_emulator
 from calib.report.page.diagnosis import write_page
-from calib.report.study_tasks import HoldOut, read_and_split
+from calib.report.study import HoldOut, read_and_split
 from calib.report.verdict import Verdict, keep_verdict, verdict
 from calib.validation.replicate import Item, replicate
 from calib.validation.sbc import SETTINGS, chosen_models

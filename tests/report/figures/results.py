@@ -12,8 +12,7 @@ from calib.inference.calibration import Calibration
 from calib.inference.estimators import PointEstimate, estimate
 from calib.inference.problem import Problem, build_problem
 from calib.models.base import Array
-from calib.report.study import OutputResult
-from calib.report.study_tasks import HoldOut, Task
+from calib.report.study import HoldOut, OutputResult, Task
 from calib.validation.prediction import predictive_draws
 from calib.validation.scores import prior_sensitivity
 from calib.validation.validate import leave_one_out, validate_held_out
