@@ -18,8 +18,8 @@ GROUPS = (
     ("check/test_reference_report.py",),
     # Calibrations of the embedded data, and the pages and figures on them.
     ("report/figures/test_print.py", "report/figures/test_plates.py", "report/test_writer.py",
-     "report/test_verdict.py", "report/test_posterior_text.py", "report/page/test_page.py",
-     "report/page/test_in_browser.py", "report/publish/", "inference/test_calibration.py",
+     "report/test_verdict.py", "report/test_words.py", "report/page/test_page.py",
+     "report/page/test_in_browser.py", "report/test_publish.py", "inference/test_calibration.py",
      "inference/test_io.py", "validation/test_prediction.py",
      "validation/test_residuals.py", "validation/test_sensitivity.py",
      "validation/test_validate.py", "validation/test_montecarlo.py", "check/test_montecarlo.py",

@@ -1,9 +1,8 @@
-"""Studies: results of each output, what becomes of a failure, the summary and the manifest."""
+"""Studies: what is calibrated on which rows, what becomes of a failure, summary and manifest."""
 
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,20 +10,163 @@ import numpy as np
 import pytest
 
 import calib.report.study as study_module
-from calib.batch.environment import Environment, sha256
+from calib.batch.environment import Environment
 from calib.data import read_table, table_from_arrays, write_table
+from calib.data.quantities import OUTPUTS
 from calib.data.reader import label_of
+from calib.errors import CalibError
 from calib.he2019 import embedded
 from calib.he2019.designs import he2019_tasks
 from calib.he2019.embedded import load_he2019
 from calib.he2019.published import PUBLISHED
 from calib.inference.prior_files import default_priors
 from calib.inference.sampler import SamplerSettings
+from calib.models import example_csv
 from calib.report.document import summarise
 from calib.report.sections import Report, work_out
-from calib.report.study import Failure, OutputResult, Study, Task, plan_tasks
-from calib.report.writer import build_manifest, file_hashes
+from calib.report.study import HoldOut, OutputResult, Study, choose_model, plan_tasks
+from calib.report.writer import build_manifest
 from tests.user_tables import pulls, table
+
+# What a study is of
+
+HELD = HoldOut("inflation_pressure_psi", 30.0)
+PSI, GROUND, CONE = "inflation_pressure_psi", "average_ground_pressure_kpa", "cone_index_kpa"
+MASS, VOLUME = "gravimetric_water_content", "volumetric_water_content"
+
+
+@pytest.mark.parametrize(
+    ("output", "columns", "model"),
+    [
+        ("drawbar_pull", {"slip_ratio": [0.1, 0.2]}, "magic_formula"),
+        ("drawbar_pull", {"slip_ratio": [0.1, 0.2], PSI: [30, 30]}, "magic_formula"),
+        ("drawbar_pull", {"slip_ratio": [0.1, 0.2], PSI: [18, 30]}, "magic_formula_pressure"),
+        ("rut_depth", {GROUND: [100, 120]}, "bekker"),
+        ("rut_depth", {"slip_ratio": [0.1, 0.1], GROUND: [100, 120]}, "bekker"),
+        ("rut_depth", {"slip_ratio": [0.1, 0.2], GROUND: [100, 120]}, "modified_bekker"),
+        ("rut_depth", {"slip_ratio": [0.1, 0.2], GROUND: [100, 100]}, "modified_bekker"),
+        ("bulk_density", {CONE: [300, 400], MASS: [0.1, 0.2]}, "ayers_perumpral"),
+        ("bulk_density", {CONE: [300, 400], VOLUME: [0.1, 0.2]}, "ayers_perumpral_volumetric"),
+        ("bulk_density", {CONE: [3, 4], MASS: [0.1, 0.2], VOLUME: [0.1, 0.2]}, "ayers_perumpral"),
+    ],
+)
+def test_the_columns_choose_the_model(output: str, columns, model: str) -> None:
+    assert (
+        choose_model(output, table(**{k: np.array(v, float) for k, v in columns.items()})) == model
+    )
+
+
+def test_among_models_that_use_the_same_the_one_of_fewest_parameters_is_chosen() -> None:
+    lines = example_csv("wismer_luth").splitlines()
+    rows = np.array([[float(cell) for cell in line.split(",")] for line in lines[1:]])
+    table = table_from_arrays(dict(zip(lines[0].split(","), rows.T, strict=True)))
+    assert choose_model("drawbar_pull", table) == "wismer_luth"
+    # What is the same in all rows does not speak for a slower model, nor for one that needs it.
+    soft = table.columns["cone_index_kpa"] == 600.0
+    assert choose_model("drawbar_pull", table.take(soft)) == "upadhyaya"
+    one = table.take(soft & (table.columns["normal_load_kn"] == 6.0))
+    assert choose_model("drawbar_pull", one) == "magic_formula"
+    with pytest.raises(CalibError, match="janosi_hanamoto: normal_stress_kpa, shear_displ"):
+        choose_model("shear_stress", table)
+
+
+def test_outputs_and_hold_outs_are_found_in_the_columns() -> None:
+    nan = np.nan
+    both = table(
+        slip_ratio=np.linspace(0, 0.3, 6),
+        average_ground_pressure_kpa=np.full(6, 100.0),
+        drawbar_pull_kn=np.array([0.0, 0.2, nan, 0.4, 0.5, 0.5]),
+        rut_depth_mm=np.array([nan, 20.0, 21.0, 22.0, 23.0, nan]),
+    )
+    tasks = plan_tasks([both])
+    assert [(t.output, t.model, len(t.table), t.held_out) for t in tasks] == [
+        ("drawbar_pull", "magic_formula", 5, None), ("rut_depth", "modified_bekker", 4, None),
+    ]  # fmt: skip
+    assert [t.output for t in plan_tasks([both], only=["rut_depth"])] == ["rut_depth"]
+    density = table(
+        "density.csv", cone_index_kpa=np.linspace(300, 900, 6),
+        gravimetric_water_content=np.full(6, 0.1), bulk_density_g_cm3=np.linspace(1.4, 1.6, 6),
+    )  # fmt: skip
+    tasks = plan_tasks([pulls(), density], HELD)
+    assert {t.output: t.held_out for t in tasks} == {"bulk_density": None, "drawbar_pull": HELD}
+    tasks = he2019_tasks()
+    assert [(t.output, t.held_out) for t in tasks] == list(
+        zip(list(OUTPUTS)[:3], (None, HELD, HELD), strict=True)
+    )
+    assert all(t.table.label == "reconstructed" for t in tasks)
+
+
+RUT = load_he2019("rut_depth")
+LONG = {GROUND: np.linspace(100, 200, 5001), "slip_ratio": np.linspace(0, 0.2, 5001),
+        "rut_depth_mm": np.linspace(20, 30, 5001)}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("tables", "held", "others", "words"),
+    [
+        ([table("a.csv", slip_ratio=np.array([0.1]))], None, {}, ["a.csv", "no output",
+         "drawbar_pull_kn"]),
+        ([table("a.csv", slip_ratio=np.array([0.1]), drawbr_pul_kn=np.array([1.0]))], None, {},
+         ["no output", "did you mean drawbar_pull_kn?"]),
+        ([table("a.csv", slp_ratio=np.array([0.1]), drawbar_pull_kn=np.array([1.0]))], None, {},
+         ["no model", "did you mean slip_ratio?"]),
+        ([pulls(source="a.csv"), pulls(source="b.csv")], None, {},
+         ["a.csv, b.csv", "drawbar_pull"]),
+        ([pulls()], HoldOut("speed_m_s", 1.0), {},
+         ["my.csv", "speed_m_s", "inflation_pressure_psi"]),
+        ([pulls()], HoldOut("spede", 1.0), {}, ["my.csv", "spede"]),
+        ([pulls()], HoldOut("inflation_pressure_psi", 31.0), {}, ["my.csv", "31", "18, 30, 42"]),
+        ([pulls()], HoldOut("inflation_pressure", 30.0), {}, ["inflation_pressure", "unit"]),
+        ([pulls(psi=(30.0,))], HELD, {}, ["my.csv", "every row"]),
+        ([table(slip_ratio=np.linspace(0, 0.3, 6), rut_depth_mm=np.linspace(20, 30, 6))], None, {},
+         ["no model of rut_depth", "bekker: average_ground_pressure_kpa", "--only"]),
+        ([RUT], None, {"models": ["bekker", "modified_bekker"]},
+         ["two models are given for", "`calib compare bekker modified_bekker FILE`"]),
+        ([RUT], None, {"models": ["bekker", "magic_formula"]},
+         ["magic_formula is for drawbar_pull_kn", "give a file with drawbar_pull_kn"]),
+        ([RUT], None, {"only": ["ruts"]}, ["no output 'ruts'", "rut_depth"]),
+        ([table_from_arrays(LONG)], None, {}, ["too many for a report"]),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_planned_is_told_before_the_work(tables, held, others, words) -> None:
+    with pytest.raises(CalibError) as caught:
+        plan_tasks(tables, held, **others)
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_models_and_priors_can_be_given(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(default_priors("bekker").read_text())
+    assert plan_tasks([RUT])[0].model == "modified_bekker"
+    (task,) = plan_tasks([RUT], models=["bekker"], prior_paths=[path])
+    assert (task.model, task.prior_path) == ("bekker", path)
+    assert plan_tasks([RUT], prior_paths=[path])[0].prior_path is None
+    # What fails does not say where the priors lie.
+    path.write_text(path.read_text().replace("sd_log = ", "sd_log = -"))
+    error = work_out([task], 1).study.failures["rut_depth"].error
+    assert "mine.toml, parameters." in error
+    assert str(tmp_path) not in error
+    path.write_text("x = 1\n")
+    with pytest.raises(CalibError, match="which model"):
+        plan_tasks([RUT], prior_paths=[path])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("inflation_pressure_psi=30", "inflation pressure 30 psi"),
+        ("inflation_pressure_kpa=160", "inflation pressure 160 kPa"),
+        ("bulk_density_g_cm3=1.5", "bulk density 1.5 g/cm^3"),
+        ("pass_number=2", "pass number 2"),
+    ],
+)
+def test_a_hold_out_is_read_and_said(text: str, words: str) -> None:
+    assert HoldOut.parse(text).words == words
+    assert str(HoldOut.parse(text)).replace(" ", "") == text
+
+
+# What was found
 
 
 @pytest.fixture(scope="module")
@@ -34,17 +176,6 @@ def study() -> Study:
     few = tasks["drawbar_pull"].table.take([0, 1])
     broken = replace(tasks["drawbar_pull"], table=few, held_out=None)
     return work_out([tasks["bulk_density"], broken, tasks["rut_depth"]], 2019).study
-
-
-def test_an_output_column_without_a_value_fails_alone() -> None:
-    empty = table(
-        slip_ratio=np.array([0.1, 0.2]),
-        average_ground_pressure_kpa=np.array([100.0, 120.0]),
-        rut_depth_mm=np.full(2, np.nan),
-    )
-    (task,) = plan_tasks([empty])
-    found = work_out([task], 1).study.failures["rut_depth"]
-    assert "0 rows cannot calibrate" in found.error
 
 
 def test_estimates_are_of_the_rows_that_the_source_estimated_from(
@@ -67,42 +198,26 @@ def test_estimates_are_of_the_rows_that_the_source_estimated_from(
     assert rows["modified_bekker"] == outer.sum() < len(rut.table)
 
 
-# Results
-
-
-def test_a_failure_leaves_the_others(study: Study) -> None:
+def test_a_failure_leaves_the_others(study: Study, monkeypatch: pytest.MonkeyPatch) -> None:
     assert list(study.results) == ["bulk_density", "drawbar_pull", "rut_depth"]
-    assert set(study.failures) == {"drawbar_pull"}
     assert set(study.successes) == {"bulk_density", "rut_depth"}
     assert "2 rows cannot calibrate magic_formula_pressure" in study.failures["drawbar_pull"].error
 
-
-@pytest.mark.parametrize("error", [KeyError("x"), RuntimeError("x"), MemoryError("x")])
-def test_any_error_of_one_output_leaves_the_others(
-    error: Exception, monkeypatch: pytest.MonkeyPatch
-) -> None:
     def fail(*args: object) -> OutputResult:
         raise error
 
     monkeypatch.setattr(study_module, "_work_out", fail)
-    found = work_out(he2019_tasks(), 1).study
-    assert set(found.failures) == {t.output for t in he2019_tasks()}
-    assert all(type(error).__name__ in f.error for f in found.failures.values())
-
-
-def test_an_interruption_is_no_failure(monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupt(*args: object) -> OutputResult:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(study_module, "_work_out", interrupt)
+    for error in (KeyError("x"), RuntimeError("x"), MemoryError("x")):
+        found = work_out(he2019_tasks(), 1).study
+        assert set(found.failures) == {t.output for t in he2019_tasks()}
+        assert all(type(error).__name__ in f.error for f in found.failures.values())
+    error = KeyboardInterrupt()
     with pytest.raises(KeyboardInterrupt):
         work_out(he2019_tasks(), 1)
 
 
 def test_rut_depth_is_validated_on_30_psi_and_density_by_leaving_one_out(study: Study) -> None:
-    rut, density = (study.results[k] for k in ("rut_depth", "bulk_density"))
-    assert isinstance(rut, OutputResult)
-    assert isinstance(density, OutputResult)
+    rut, density = (study.successes[k] for k in ("rut_depth", "bulk_density"))
     assert rut.validation.method == "held_out"
     assert set(rut.validation.table["inflation_pressure_psi"]) == {30.0}
     assert set(rut.calibration.problem.table["inflation_pressure_psi"]) == {18.0, 42.0}
@@ -110,24 +225,11 @@ def test_rut_depth_is_validated_on_30_psi_and_density_by_leaving_one_out(study: 
     assert len(density.validation.observed) == len(density.task.table) == 36
     assert rut.prior_predictive.shape == (1000, 18)
     assert rut.posterior_predictive.shape == (4000, 18)
-    assert rut.by_pressure == {}
-
-
-def test_the_prior_predictive_is_wide_and_the_posterior_predictive_is_not(study: Study) -> None:
-    rut = study.results["rut_depth"]
-    assert isinstance(rut, OutputResult)
-    prior, posterior = (
-        np.nanstd(np.log(draws), axis=0).mean()
-        for draws in (rut.prior_predictive, rut.posterior_predictive)
-    )
     # By the priors: sd of ln z about 1; by 18 rows: the noise, about 0.1.
-    assert prior > 0.7
-    assert posterior < 0.2
-
-
-def test_the_published_regression_comes_out(study: Study) -> None:
-    rut = study.results["rut_depth"]
-    assert isinstance(rut, OutputResult)
+    spread = [np.nanstd(np.log(d), axis=0).mean()
+              for d in (rut.prior_predictive, rut.posterior_predictive)]  # fmt: skip
+    assert spread[0] > 0.7
+    assert spread[1] < 0.2
     regression = next(e for e in rut.estimates if e.method == "published_regression")
     for name, figure in PUBLISHED.rut_depth.estimates.items():
         assert figure.agrees(regression.reported[name]), name
@@ -163,79 +265,54 @@ def test_progress_names_what_is_done() -> None:
 
 
 def test_the_summary_carries_what_was_promised(study: Study) -> None:
-    document = summarise(study)
+    document = json.loads(json.dumps(summarise(study), allow_nan=False))
     models = document["models"]
     assert list(models) == ["bulk_density", "drawbar_pull", "rut_depth"]
     assert set(models["drawbar_pull"]) == {"model", "error"}
-    for key in ("bulk_density", "rut_depth"):
-        entry = models[key]
-        result = study.results[key]
-        assert isinstance(result, OutputResult)
-        for parameter, s in result.calibration.summary.items():
+    for key, result in study.successes.items():
+        entry, calibration = models[key], result.calibration
+        for parameter, s in calibration.summary.items():
             found = entry["posterior"][parameter]
-            for name in ("mean", "sd", "hdi_lower", "hdi_upper", "ess_bulk", "ess_tail", "rhat"):
+            for name in set(found) - {"posterior_to_prior_sd"}:
                 assert found[name] == getattr(s, name)
-            for name in ("mcse_mean", "mcse_median", "mcse_hdi_lower", "mcse_hdi_upper"):
-                assert found[name] == getattr(s, name)
-        report = result.calibration.draws.report
-        gate = entry["sampling"]["gate"]
-        assert gate["largest_rhat"] == max(report.rhat)
-        assert gate["smallest_ess_bulk"] == min(report.ess_bulk)
-        assert gate["smallest_ess_tail"] == min(report.ess_tail)
-        assert gate["smallest_steps_over_tau"] == min(report.steps / report.tau)
-        assert set(entry["priors"]) == {p.name for p in result.calibration.problem.priors.entries}
+        report = calibration.draws.report
+        assert entry["sampling"]["gate"] == {
+            "largest_rhat": max(report.rhat), "smallest_ess_bulk": min(report.ess_bulk),
+            "smallest_ess_tail": min(report.ess_tail),
+            "smallest_steps_over_tau": min(report.steps / report.tau),
+        }  # fmt: skip
+        assert entry["sampling"]["converged"] is True
+        assert entry["sampling"]["steps"] == report.steps
+        assert set(entry["priors"]) == {p.name for p in calibration.problem.priors.entries}
         for name, found in entry["data"]["ranges"].items():
-            values = result.calibration.problem.table[name]
+            values = calibration.problem.table[name]
             assert (found["lower"], found["upper"]) == (values.min(), values.max())
             assert found["distinct"] == len(set(values.tolist()))
-        sensitivity = entry["prior_sensitivity"]["parameters"]
-        assert set(sensitivity) == set(entry["posterior"])
         for parameter, reaction in result.sensitivity.items():
-            assert sensitivity[parameter]["prior"] == reaction.prior
-            assert sensitivity[parameter]["identified"] is reaction.identified
-        assert set(entry["validation"]["coverage"]) == {"50", "90", "95"}
-        scores = result.validation.scores
+            found = entry["prior_sensitivity"]["parameters"][parameter]
+            assert (found["prior"], found["identified"]) == (reaction.prior, reaction.identified)
+        scores, found = result.validation.scores, entry["validation"]
         for name in ("n", "rmse", "crps", "max_relative_error"):
-            assert entry["validation"][name] == getattr(scores, name)
-        assert entry["validation"]["coverage"]["90"] == scores.coverage[0.9].proportion
-        assert entry["sampling"]["converged"] is True
-        assert entry["sampling"]["ensembles"] >= 4
-        assert entry["sampling"]["steps"] == result.calibration.draws.report.steps
+            assert found[name] == getattr(scores, name)
+        assert found["coverage"] == {f"{100 * c.level:g}": c.proportion
+                                     for c in scores.coverage.values()}  # fmt: skip
         for e in result.estimates:
             assert entry["estimates"][e.method] == e.reported
         assert entry["data"]["label"] == "reconstructed"
     assert models["rut_depth"]["data"]["held_out"] == "inflation_pressure_psi = 30"
     assert models["bulk_density"]["validation"]["refits_not_converged"] == []
-
-
-def test_the_summary_is_strict_json(study: Study) -> None:
-    text = json.dumps(summarise(study), allow_nan=False)
-
-    def numbers(value):
-        if isinstance(value, dict):
-            for v in value.values():
-                yield from numbers(v)
-        elif isinstance(value, list):
-            for v in value:
-                yield from numbers(v)
-        elif isinstance(value, float):
-            yield value
-
-    assert all(math.isfinite(x) for x in numbers(json.loads(text)))
     # A derived parameter has no prior of its own.
-    posterior = json.loads(text)["models"]["rut_depth"]["posterior"]
-    assert posterior["k"]["posterior_to_prior_sd"] is None
+    assert models["rut_depth"]["posterior"]["k"]["posterior_to_prior_sd"] is None
 
 
-def test_the_manifest_says_what_a_result_was_made_from(study: Study, tmp_path: Path) -> None:
+def test_the_manifest_says_what_a_result_was_made_from(study: Study) -> None:
     inputs = {key: {"data": {"file": f"data/{key}.csv"}} for key in study.results}
-    settings = SamplerSettings(max_steps=1000)
     found = build_manifest(
-        Report(study), settings, ["calib", "report"], "", Environment.here(), inputs
-    )
+        Report(study), SamplerSettings(max_steps=1000), ["calib", "report"], "",
+        Environment.here(), inputs,
+    )  # fmt: skip
     assert json.loads(json.dumps(found)) == found
-    assert found["command"] == ["calib", "report"]
-    assert found["seed"] == 2019
+    assert (found["command"], found["seed"]) == (["calib", "report"], 2019)
     assert found["settings"]["max_steps"] == 1000
     assert found["settings"]["gate"]["rhat_max"] == 1.01
     assert set(found["versions"]) >= {"python", "numpy", "emcee", "arviz"}
@@ -243,25 +320,16 @@ def test_the_manifest_says_what_a_result_was_made_from(study: Study, tmp_path: P
     assert [found["genetic_algorithm"][k] for k in ("F", "CP", "MP", "NP")] == [0.4, 0.6, 0.1, 50]
     task = found["tasks"]["rut_depth"]
     assert task["held_out"] == {"column": "inflation_pressure_psi", "value": 30.0}
-    assert task["label"] == "reconstructed"
-    assert task["data"] == {"file": "data/rut_depth.csv"}
-
-
-def test_durations_are_in_the_manifest_alone(study: Study) -> None:
-    inputs = {key: {} for key in study.results}
-    seconds = build_manifest(Report(study), SamplerSettings(), [], "", Environment.here(), inputs)[
-        "seconds"
-    ]
-    assert seconds["study"] == study.seconds
-    assert set(seconds) == {"study", *study.successes}
-    assert seconds["rut_depth"]["sample"] > 0.0
-    assert set(seconds["rut_depth"]["methods"]) >= {"genetic", "least_squares"}
+    assert (task["label"], task["data"]) == ("reconstructed", {"file": "data/rut_depth.csv"})
+    # Durations are in the manifest alone.
+    assert set(found["seconds"]) == {"study", *study.successes}
+    assert found["seconds"]["rut_depth"]["sample"] > 0.0
+    assert set(found["seconds"]["rut_depth"]["methods"]) >= {"genetic", "least_squares"}
     assert "seconds" not in json.dumps(summarise(study))
 
 
 def test_the_mode_is_stated_with_its_density(study: Study) -> None:
-    rut = study.results["rut_depth"]
-    assert isinstance(rut, OutputResult)
+    rut = study.successes["rut_depth"]
     sampling = summarise(study)["models"]["rut_depth"]["sampling"]
     problem = rut.calibration.problem
     natural = np.array([list(sampling["mode"].values())])
@@ -273,28 +341,7 @@ def test_the_mode_is_stated_with_its_density(study: Study) -> None:
     assert problem.log_prob(around).max() < sampling["log_posterior_at_mode"]
 
 
-def test_a_failure_does_not_say_where_the_priors_lie(tmp_path: Path) -> None:
-    path = tmp_path / "mine.toml"
-    path.write_text(default_priors("bekker").read_text().replace("sd_log = ", "sd_log = -"))
-    (task,) = plan_tasks([load_he2019("rut_depth")], models=["bekker"], prior_paths=[path])
-    error = work_out([task], 1).study.failures["rut_depth"].error
-    assert "mine.toml, parameters." in error
-    assert str(tmp_path) not in error
-
-
-def test_hashes_are_of_every_file_but_the_manifest(tmp_path: Path) -> None:
-    (tmp_path / "figures").mkdir()
-    (tmp_path / "figures" / "a.png").write_bytes(b"abc")
-    (tmp_path / "manifest.json").write_text("{}")
-    # FIPS 180-2, appendix B.1.
-    digest = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
-    assert file_hashes(tmp_path) == {"figures/a.png": digest}
-    assert sha256(b"abc") == digest
-
-
-def test_failures_and_tasks_are_plain_records() -> None:
-    task = Task("rut_depth", "bekker", pulls())
-    assert Failure(task, "x").task is task
+# The embedded data are recognised
 
 
 def test_the_embedded_data_are_recognised_in_a_file(tmp_path: Path) -> None:
@@ -324,7 +371,7 @@ def test_embedded_data_are_recognised_in_other_units_and_rounded(tmp_path: Path)
 
 def test_readings_that_agree_by_chance_are_not_called_reconstructed() -> None:
     """Tables of 1 to 1000 rows, of 1 to 4 decimals, near the curves of the embedded data."""
-    for seed in range(300):
+    for seed in range(60):
         rng = np.random.default_rng(seed)
         n, places = int(rng.choice([1, 3, 40, 200, 1000])), int(rng.integers(1, 5))
         slip = rng.uniform(0.02, 0.5, n)
