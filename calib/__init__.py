@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from calib.inference.sampler import SamplerSettings
     from calib.models import MODELS, Model
     from calib.models.simulators.declaration import from_callable, read_simulator
-    from calib.report.gap_evidence import gap_verdict
+    from calib.report.gap_words import gap_verdict
     from calib.report.verdict import Verdict, verdict
     from calib.validation.prediction import Prediction, predict
     from calib.validation.validate import Validation, leave_one_out, validate_held_out
@@ -78,7 +78,7 @@ _HOME = {
     "Validation": "calib.validation.validate",
     "Verdict": "calib.report.verdict",
     "verdict": "calib.report.verdict",
-    "gap_verdict": "calib.report.gap_evidence",
+    "gap_verdict": "calib.report.gap_words",
     "leave_one_out": "calib.validation.validate",
     "validate_held_out": "calib.validation.validate",
 }

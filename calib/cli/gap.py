@@ -42,19 +42,17 @@ def diagnose(
     from calib.batch.folders import claimed, fresh_folder, keep
     from calib.batch.pool import pool
     from calib.batch.user_code import run_file
-    from calib.data.quantities import OUTPUTS, QUANTITIES
     from calib.gap.batch import INPUTS, inputs_record
     from calib.gap.case import case_from_run, read_case
+    from calib.gap.describe import gap_document
     from calib.gap.diagnose import diagnose as diagnose_case
     from calib.gap.effects import EFFECTS
     from calib.gap.effects.user import check_effects, load_effects
     from calib.gap.files import write_diagnosis
     from calib.models import get_model
     from calib.models.simulators.emulator import emulator_of, save_emulator
-    from calib.report.gap_evidence import gap_verdict
-    from calib.report.gap_facts import track_record_text
-    from calib.report.numbers import format_number
-    from calib.report.page.diagnosis import begin_page
+    from calib.report.gap_words import Words
+    from calib.report.page.diagnosis import write_page
 
     ctx.with_resource(claimed(out, overwrite=overwrite))
     if case is not None and run is None and field is None:
@@ -74,40 +72,21 @@ def diagnose(
     # The diagnosis looks at them too, but only after simulators have been emulated.
     check_effects(considered, given)
     emulations = prepare_case(given, run, seed, workers)
-    manifest = {"seed": seed, "command": opt.command()}
     with pool(workers, {} if effects is None else {effects: run_file}) as side:
         found = diagnose_case(given, seed, effects=considered, pool=side)
-        keep("diagnosis", partial(write_diagnosis, found))
-        write_page = begin_page(found, manifest, pool=side)
-        with fresh_folder(out, overwrite=overwrite) as folder:
-            write_diagnosis(found, folder)
-            for model in given.models.values():
-                if (emulator := emulator_of(get_model(model))) is not None:
-                    save_emulator(emulator, model, folder / "emulators" / f"{model}.npz")
-            contents = {path.name: path.read_bytes() for path in files}
-            (folder / INPUTS).write_bytes(inputs_record(found.data.case, seed, contents))
-            write_page(folder)
+    keep("diagnosis", partial(write_diagnosis, found))
+    document = gap_document(found, command=opt.command())
+    with fresh_folder(out, overwrite=overwrite) as folder:
+        write_diagnosis(found, folder, document)
+        for model in given.models.values():
+            if (emulator := emulator_of(get_model(model))) is not None:
+                save_emulator(emulator, model, folder / "emulators" / f"{model}.npz")
+        contents = {path.name: path.read_bytes() for path in files}
+        (folder / INPUTS).write_bytes(inputs_record(found.data.case, seed, contents))
+        write_page(document, folder)
     for warning in found.warnings:
         announce(warning)
-    judged = gap_verdict(found)
-    print(f"verdict: {found.verdict} ({judged.headline})")
-    probability = found.ranking.probability
-    for name in found.ranking.order[:4]:
-        p = probability[name]
-        text = ">0.999" if p >= 0.9995 else "<0.001" if p < 0.0005 else f"{p:.3f}"
-        print(f"  {text:>6}  {name}")
-    print(track_record_text(probability[found.ranking.order[0]]))
-    for output, s in found.shrink.items():
-        low, high = s.interval
-        unit = QUANTITIES[OUTPUTS[output]].unit_word
-        print(
-            f"{output}: error {format_number(s.rmse_before)} -> {format_number(s.rmse_after)} "
-            f"{unit} rms, shrink {100 * s.fraction:.0f} % (90 % interval {100 * low:.0f} to "
-            f"{100 * high:.0f} %), noise sd {format_number(s.noise_floor)} {unit}"
-        )
-    for label, words in judged.facts:
-        if label in ("Not tested", "Assumed"):
-            print(f"{label.lower()}: {words}")
+    print(Words(document).terminal())
     print(out / "index.html")
     code = 0 if all(e.passed for e in emulations) else 3
     finish(code, out / "diagnosis.json", folder=str(out), warnings=list(found.warnings))

@@ -1,181 +1,77 @@
-"""The files of a diagnosis: written, checked against each other, compared with a track record."""
+"""The files of a diagnosis that programs read: written, and checked against each other."""
 
 from __future__ import annotations
 
 import json
-import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cache
-from importlib.resources import files
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.special import betaincinv
 
 from calib.data import write_table
 from calib.data.files import inside
-from calib.data.quantities import OUTPUTS
 from calib.errors import FAULTS, CalibError
 from calib.gap.case import words_of
 from calib.gap.corrected import load_corrected, save_corrected
+from calib.gap.describe import gap_document
 from calib.gap.diagnose import Diagnosis
-from calib.gap.fit import Fit
-from calib.gap.mixture import Included, Region, row_gaps
-from calib.models.base import Array
-
-# What the cases are, which is not what a user has.
-BENCH = (
-    "simulated campaigns of calib's own bench, whose mechanics share no formula with the "
-    "diagnosis; no measured ones"
-)
-
-
-@dataclass(frozen=True)
-class TrackRecord:
-    """Blind cases whose first explanation was stated between two ends, and how many were right."""
-
-    low: float
-    high: float
-    cases: int
-    right: int
-
-    @property
-    def share(self) -> float:
-        """Part of them that was right."""
-        return self.right / self.cases
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """Jeffreys 95 % interval of that part, closed at the ends where all or none were right."""
-        a, b = self.right + 0.5, self.cases - self.right + 0.5
-        low = float(betaincinv(a, b, 0.025)) if self.right else 0.0
-        high = float(betaincinv(a, b, 0.975)) if self.right < self.cases else 1.0
-        return low, high
-
-
-def track_record(probability: float) -> TrackRecord:
-    """Return the record of the bin that the probability of a first explanation lies in."""
-    return next(r for r in reversed(_records()) if probability >= r.low)
-
-
-@cache
-def _records() -> tuple[TrackRecord, ...]:
-    """The bins in order, all seeds together."""
-    text = files("calib.gap").joinpath("track_record.toml").read_text(encoding="utf-8")
-    pooled: dict[tuple[float, float], list[int]] = {}
-    for record in tomllib.loads(text)["record"]:
-        for low, high, cases, right in record["bins"]:
-            sums = pooled.setdefault((low, high), [0, 0])
-            sums[0] += cases
-            sums[1] += right
-    return tuple(TrackRecord(*ends, *sums) for ends, sums in sorted(pooled.items()))
-
+from calib.gap.document import BENCH, FILE, Cause, Explanation, GapDocument
+from calib.gap.mixture import Region, row_gaps
 
 SCHEMA = "calib/diagnosis/1"
 
 
 def document(found: Diagnosis) -> dict[str, Any]:
     """Return a diagnosis as the contract's JSON document."""
-    ranking = found.ranking
-    # Where the data are from the label says.
-    case = found.data.case
-    warnings = [w for w in found.warnings if w not in case.notes]
-    # The same wherever the case lies.
-    for table in filter(None, (case.lab, case.field, case.new_conditions)):
-        warnings = [w.replace(table.source, Path(table.source).name) for w in warnings]
+    return contract(gap_document(found))
+
+
+def contract(d: GapDocument) -> dict[str, Any]:
+    """Return the content of ``diagnosis.json``."""
+    record = d.track_record
     return {
         "schema": SCHEMA,
-        **({"data_label": found.data.case.label} if found.data.case.label else {}),
-        "verdict": found.verdict,
-        **({"warnings": warnings} if warnings else {}),
+        **({"data_label": d.label} if d.label else {}),
+        "verdict": d.verdict,
+        **({"warnings": list(d.warnings)} if d.warnings else {}),
         "effects": [
-            {
-                "name": name,
-                "probability": ranking.probability[name],
-                "parameters": _parameters(ranking.best(name)),
-            }
-            for name in ranking.order
+            {"name": e.name, "probability": e.probability, "parameters": _parameters(e)}
+            for e in d.explanations
         ],
-        "track_record": _track_record(ranking.probability[ranking.order[0]]),
-        "inclusion": {name: _included(c) for name, c in found.inclusion.causes.items()},
-        "remainder": {
-            **_included(found.inclusion.residual_discrepancy),
-            "where": [
-                {"output": r.output, "conditions": _ends(found, r)} for r in found.inclusion.where
-            ],
+        "track_record": {
+            "stated": [record.low, record.high],
+            "cases": record.cases,
+            "right": record.right,
+            "share": record.share,
+            "interval": list(record.interval),
+            "of": BENCH,
         },
-        "not_testable": [{"name": n, "reason": r} for n, r in ranking.not_testable.items()],
-        "where": _rows(found),
-        "regions": [
-            {
-                "output": r.output,
-                "conditions": _ends(found, r),
-                "gap": r.gap,
-                "probability": r.probability,
-            }
-            for r in found.regions
-        ],
+        "inclusion": {cause.name: _included(cause) for cause in d.causes},
+        "remainder": _included(d.remainder) | {"where": [_place(d, r) for r in d.remainder_where]},
+        "not_testable": [{"name": n, "reason": r} for n, r in d.not_testable.items()],
+        "where": _rows(d),
+        "regions": [_place(d, r) | {"gap": r.gap, "probability": r.probability} for r in d.regions],
         "shrink": {
-            name: {
-                "rmse_before": s.rmse_before,
-                "rmse_after": s.rmse_after,
-                "fraction": s.fraction,
-                "interval": list(s.interval),
-                "noise_floor": s.noise_floor,
-            }
-            for name, s in found.shrink.items()
+            name: asdict(s) | {"interval": list(s.interval)} for name, s in d.shrink.items()
         },
         "next_measurement": [
             {
                 "separates": list(m.separates),
                 "conditions": {
-                    name: words_of(found.data.case.covariates, name, value, value) or value
+                    name: words_of(d.covariates, name, value, value) or value
                     for name, value in m.conditions.items()
                 },
                 "gain_nats": m.gain_nats,
             }
-            for m in found.next_measurements
+            for m in d.next_measurements
         ],
     }
 
 
-def _track_record(probability: float) -> dict[str, Any]:
-    """Return how often first explanations that were as probable were right."""
-    r = track_record(probability)
-    return {
-        "stated": [r.low, r.high],
-        "cases": r.cases,
-        "right": r.right,
-        "share": r.share,
-        "interval": list(r.interval),
-        "of": BENCH,
-    }
-
-
-def _rows(found: Diagnosis) -> list[dict[str, Any]]:
-    """Return an entry for every field row and output; rows that were not judged by say why."""
-    unused = {name: np.array([*rows], np.int64) for name, rows in found.unused.items()}
-    others = row_gaps(found.data, found.truth, unused) if unused else ()
-    said = {
-        (g.output, int(row)): {"gap": float(gap), "gap_sd": float(sd), "probability": float(p)}
-        for g in (*found.gaps, *others)
-        for row, gap, sd, p in zip(g.rows, g.gap, g.sd, g.probability, strict=True)
-    }
-    place = {name: i for i, name in enumerate(found.data.names)}
-    rows = []
-    for output, row in sorted(said, key=lambda at: (place[at[0]], at[1])):
-        why = found.unused.get(output, {}).get(row)
-        rows.append(
-            {"output": output, "row": row, **said[output, row]}
-            | ({} if why is None else {"used": False, "reason": why})
-        )
-    return rows
-
-
 def answer(told: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what is repeated elsewhere of a diagnosis' document; its first effect is the best."""
+    """Return what is repeated elsewhere of ``diagnosis.json``; its first effect is the best."""
     best = told["effects"][0]
     return {
         "verdict": told["verdict"],
@@ -186,16 +82,37 @@ def answer(told: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _ends(found: Diagnosis, region: Region) -> dict[str, list[float] | list[str]]:
-    """Return the ends of a region, or the value of a category that it is."""
-    covariates = found.data.case.covariates
+def write_diagnosis(found: Diagnosis, folder: Path, d: GapDocument | None = None) -> None:
+    """Write what programs read, and the document, into an existing folder.
+
+    Parameters
+    ----------
+    found : Diagnosis
+    folder : Path
+    d : GapDocument, optional
+        Of the diagnosis, if it was computed before.
+    """
+    d = d or gap_document(found)
+    (folder / FILE).write_bytes(d.json())
+    (folder / "diagnosis.json").write_text(json.dumps(contract(d), indent=1) + "\n")
+    save_corrected(found.corrected, folder)
+    if d.prediction:
+        write_table(
+            folder / "fresh_prediction.csv",
+            {n: [*v] if isinstance(v[0], str) else np.array(v) for n, v in d.prediction.items()},
+        )
+
+
+def _parameters(explanation: Explanation) -> dict[str, dict[str, float]]:
+    """Effect parameters with their sds, prefixed with the effect where there are several."""
+    several = len({p.effect for p in explanation.parameters}) > 1
     return {
-        name: [words_of(covariates, name, *ends)] if covariates.get(name) else list(ends)
-        for name, ends in region.conditions.items()
+        f"{p.effect}.{p.name}" if several else p.name: {"mean": p.mean, "sd": p.sd}
+        for p in explanation.parameters
     }
 
 
-def _included(cause: Included) -> dict[str, Any]:
+def _included(cause: Cause) -> dict[str, Any]:
     return {
         "probability": cause.probability,
         "share": cause.share,
@@ -203,46 +120,31 @@ def _included(cause: Included) -> dict[str, Any]:
     }
 
 
-def _parameters(fit: Fit) -> dict[str, dict[str, float]]:
-    """Effect parameters with their sds, natural scale, prefixed with the effect in a pair."""
-    sd = np.sqrt(np.diag(fit.covariance))
-    effects = fit.forward.hypothesis.effects
-    found = {}
-    for effect, priors, part in zip(
-        effects, fit.forward.hypothesis.effect_priors, fit.forward.phi_slices, strict=True
-    ):
-        natural = priors.to_natural(fit.psi[None, part])[0]
-        spread = dict(zip(priors.names, sd[part], strict=True))
-        for prior, value in zip(priors.entries, natural, strict=True):
-            # A parameter that the prior file holds fixed has no spread.
-            s = spread.get(prior.name, 0.0)
-            name = prior.name if len(effects) == 1 else f"{effect.name}.{prior.name}"
-            # A log-normal parameter's sd is that of its logarithm times its value.
-            found[name] = {"mean": float(value), "sd": float(s * value if prior.log else s)}
-    return found
-
-
-def write_diagnosis(found: Diagnosis, folder: Path) -> None:
-    """Write the files of a diagnosis into an existing folder."""
-    (folder / "diagnosis.json").write_text(json.dumps(document(found), indent=1) + "\n")
-    save_corrected(found.corrected, folder)
-    new = found.data.case.new_conditions
-    if new is None:
-        return
-    columns: dict[str, Array | list[str]] = {
-        name: [row[j] for row in new.text] for j, name in enumerate(new.header)
+def _place(d: GapDocument, region: Region) -> dict[str, Any]:
+    """Return a region's output and its ends, or the value of a category that it is."""
+    ends = {
+        name: [words_of(d.covariates, name, *ends)] if d.covariates.get(name) else list(ends)
+        for name, ends in region.conditions.items()
     }
-    if not new.text:
-        columns = dict(new.columns)
-    if found.data.case.label:
-        columns["data_label"] = [found.data.case.label] * len(new)
-    for name, prediction in found.new_predictions.items():
-        column = OUTPUTS[name]
-        columns[f"{column}_before"] = prediction.before
-        columns[f"{column}_after"] = prediction.after
-        columns[f"{column}_after_lower"] = prediction.lower
-        columns[f"{column}_after_upper"] = prediction.upper
-    write_table(folder / "fresh_prediction.csv", columns)
+    return {"output": region.output, "conditions": ends}
+
+
+def _rows(d: GapDocument) -> list[dict[str, Any]]:
+    """Return an entry for every field row and output; rows that were not judged by say why."""
+    entries = []
+    for o in d.outputs:
+        own: dict[int, dict[str, Any]] = {
+            row: {"gap": gap, "gap_sd": sd, "probability": p}
+            for row, gap, sd, p in zip(o.rows, o.gap, o.gap_sd, o.probability, strict=True)
+        }
+        for u in d.unused:
+            if u.output == o.name:
+                own[u.row] = {
+                    "gap": u.gap, "gap_sd": u.gap_sd, "probability": u.probability, "used": False,
+                    "reason": u.reason,
+                }  # fmt: skip
+        entries += [{"output": o.name, "row": row, **own[row]} for row in sorted(own)]
+    return entries
 
 
 def misquoted(said: Any, folder: Path) -> str:

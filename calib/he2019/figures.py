@@ -22,7 +22,7 @@ from calib.he2019.gaps import FoundGap
 from calib.models.base import Array
 from calib.models.magic_formula import magic_formula
 from calib.models.soil import rut_depth
-from calib.report.figures.gap import probability_text
+from calib.report.figures.gap import OutputRows, output_rows
 from calib.report.figures.plate import Plate, draw_all
 from calib.report.figures.style import (
     BLACK,
@@ -41,7 +41,7 @@ from calib.report.figures.style import (
     panels,
     style,
 )
-from calib.report.gap_facts import OutputRows, output_rows, output_word, short_name
+from calib.report.gap_words import chance, short_name
 from calib.report.labels import NO_UNIT, axis_of, joined, short
 from calib.report.reference import FittedTable
 
@@ -376,7 +376,7 @@ _PRESSURES = (18.0, 30.0, 42.0)
 @style()
 def gap_plate(result: FoundGap) -> Plate:
     """Draw errors over slip before and after the correction, and the probabilities."""
-    own = output_rows(result.found)[0]
+    own = output_rows(result.document)[0]
     rows = 2 if result.gap.unfitted is not None else 1
     fig, axes = panels(1, 3, height=46.0, top=6.0, bottom=12.0 + 4.0 * rows)
     # The names of the hypotheses need the room beside the last panel.
@@ -400,7 +400,7 @@ def gap_plate(result: FoundGap) -> Plate:
     _same_height(before, after)
     after.tick_params(labelleft=False)
     before.set_ylabel(f"Measured minus predicted ({own.axis.unit})")
-    before.set_title(f"Before: {output_word(own.name)}", loc="left")
+    before.set_title(f"Before: {own.name.replace('_', ' ')}", loc="left")
     after.set_title("After: corrected model", loc="left")
     _which(which, result)
     handles, labels = _key(pressure, kept_out=kept_out)
@@ -470,7 +470,7 @@ def _which(ax: Axes, result: FoundGap) -> None:
     y = np.arange(len(names))[::-1]
     for i, (yi, name) in enumerate(zip(y, names, strict=True)):
         ax.barh(yi, p[name], color=BLUE if i == 0 else SKY, height=0.62)
-        ax.text(p[name] + 0.03, yi, probability_text(p[name]), va="center", fontsize=SMALLEST_PT)
+        ax.text(p[name] + 0.03, yi, chance(p[name]), va="center", fontsize=SMALLEST_PT)
     ax.set_yticks(y, [short_name(name).replace(" + ", "\n+ ") for name in names])
     ax.tick_params(axis="y", length=0.0, labelsize=SMALLEST_PT)
     ax.set_ylim(-0.6, len(names) - 0.4)
@@ -512,7 +512,7 @@ def _caption(own: OutputRows, *, kept_out: bool) -> str:
     )
     unit = own.axis.unit
     text = (
-        f"Left, measured {output_word(own.name)} minus the calibrated simulator at the "
+        f"Left, measured {own.name.replace('_', ' ')} minus the calibrated simulator at the "
         f"{own.rows.size} field rows, {before} {unit} rms; a miss inside the dashed lines is no "
         f"more than the calibration left open. Middle, minus the corrected model, {after} {unit} "
         f"rms; the noise is {short(float(np.median(own.noise)))} {unit}."

@@ -17,7 +17,7 @@ import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +31,10 @@ from calib.data import Table, table_from_arrays, write_table
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 from calib.gap.case import Case
+from calib.gap.describe import gap_document
 from calib.gap.diagnose import Diagnosis, diagnose
-from calib.gap.files import answer, document
+from calib.gap.document import GapDocument
+from calib.gap.files import answer, contract
 from calib.he2019 import declared
 from calib.he2019.embedded import load_he2019
 from calib.he2019.published import LABEL, PUBLISHED
@@ -243,6 +245,11 @@ class FoundGap:
     variants: Mapping[str, Diagnosis]
     open_sd: Array
 
+    @cached_property
+    def document(self) -> GapDocument:
+        """All that the diagnosis found, in numbers."""
+        return gap_document(self.found)
+
     @property
     def output(self) -> str:
         """The one output that the case models."""
@@ -404,7 +411,7 @@ def _slip_checks(result: FoundGap) -> tuple[Check, ...]:
 def _shift(found: Diagnosis) -> dict[str, float]:
     """Return the shift that a wrong radius makes at zero recorded slip, in percentage points."""
     name = "slip_zero_shift"
-    effect = next(e for e in document(found)["effects"] if e["name"] == name)
+    effect = next(e for e in contract(gap_document(found))["effects"] if e["name"] == name)
     mean, sd = (100.0 * effect["parameters"]["radius_error"][key] for key in ("mean", "sd"))
     return {
         "probability": float(found.ranking.probability[name]),
@@ -496,7 +503,7 @@ def _one(result: FoundGap) -> dict[str, Any]:
         "models": dict(found.data.case.models),
         "rows": {"calibration": len(found.data.case.lab), "field": len(found.data.case.field)},
         "withheld": result.gap.withheld,
-        **answer(document(found)),
+        **answer(contract(result.document)),
         "open_sd_rms": float((result.open_sd**2).mean() ** 0.5),
         "checks": {check.name: dict(check.values) for check in checks(result)},
         "variants": {name: _answer(other) for name, other in result.variants.items()},

@@ -7,7 +7,7 @@ import re
 import shlex
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,12 +38,11 @@ from calib.he2019.gaps import (
 from calib.he2019.published import DOI
 from calib.models import get_model
 from calib.report.figures.plate import Plate
-from calib.report.gap_evidence import gap_verdict
-from calib.report.gap_facts import short_name
+from calib.report.gap_words import gap_verdict, short_name
 from calib.report.labels import odds_text, percent, percent_range, unbroken
 from calib.report.markup import unit_html
 from calib.report.numbers import NOTHING, format_number
-from calib.report.page.diagnosis import TONE_MARKS, render_diagnosis
+from calib.report.page.diagnosis import TONE_MARKS, render_page
 from calib.report.page.template import data_uri, picture, png_size, sentences, template
 from calib.report.sections import Section, Target
 from calib.report.study import Progress, Study
@@ -179,17 +178,17 @@ def _write_gap(
         file.write_bytes(pdf_bytes(plate.figure))
     inner = folder / "gaps" / result.gap.name
     inner.mkdir(parents=True)
-    write_diagnosis(result.found, inner)
-    drawn = gap_plates(result.found)
-    images = {f"{p.name}.png": png(p) for p in drawn if p.figure is not None}
-    page = render_diagnosis(result.found, drawn, images, manifest={"versions": versions})
-    (inner / "index.html").write_text(page, encoding="utf-8")
+    document = replace(result.document, versions=dict(versions))
+    write_diagnosis(result.found, inner, document)
+    drawn = gap_plates(document)
+    images = {p.name: png(p) for p in drawn if p.figure is not None}
+    (inner / "index.html").write_text(render_page(document, drawn, images), encoding="utf-8")
     return _block(result, plate, image)
 
 
 def _block(result: FoundGap, plate: Plate, image: bytes) -> dict[str, Any]:
     gap, found = result.gap, result.found
-    verdict, ranking, case = gap_verdict(found), found.ranking, found.data.case
+    verdict, ranking, case = gap_verdict(result.document), found.ranking, found.data.case
     best = ranking.order[0]
     s = found.shrink.get(result.output)
     return {

@@ -150,6 +150,13 @@ def unit_plain(unit: str) -> str:
     return degrees(unit).replace("^2", "²").replace("^3", "³")
 
 
+def unit_after(unit: str) -> str:
+    """Return a unit to put after a number, with a space; nothing where there is none."""
+    if unit in ("1", "", "dimensionless"):
+        return ""
+    return " %" if unit == "percent" else f" {degrees(unit)}"
+
+
 def parameter_label(name: str, unit: str, *, log: bool = False) -> str:
     """Return symbol and unit of a parameter for an axis."""
     inside = symbol(name)

@@ -104,7 +104,7 @@ def _sampled(model: Model) -> str:
         path = Path(folder) / "example.csv"
         path.write_text(example_of(model), encoding="utf-8")
         table = read_for_model(path, (*model.conditions, model.output))
-    said = parametrisation(model.bind(table.columns))
+    said = parametrisation(model.parametrisation, model.bind(table.columns).references)
     return f"{words(said)} (The numbers are those of the example below.)\n"
 
 

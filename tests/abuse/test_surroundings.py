@@ -166,7 +166,7 @@ def test_an_interruption_loses_no_posterior(words: list[str], stage: str, kept: 
 
 def test_an_interrupted_diagnosis_that_was_made_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
     write_case(make_case("force_offset", models=PULL_ONLY, n_lab=15, n_field=12), Path("case"))
-    monkeypatch.setattr("calib.report.page.diagnosis.begin_page", interrupt)
+    monkeypatch.setattr("calib.report.page.diagnosis.write_page", interrupt)
     done = run("diagnose", "case", "--workers", "1", "--out", "found")
     assert (done.exit_code, "what was finished is in found-unfinished" in done.stderr) == (
         130,

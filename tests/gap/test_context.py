@@ -19,8 +19,7 @@ from calib.gap.hypotheses import (
 )
 from calib.gap.odds import Odds
 from calib.inference.priors import Prior, Priors
-from calib.report.gap_evidence import gap_evidence
-from calib.report.gap_verdict import judge_gap
+from calib.report.gap_words import gap_verdict
 from tests.gap.cases import CHOICE, PULL_ONLY, make_case, write_case
 
 
@@ -43,8 +42,10 @@ def test_an_excluded_cause_is_not_tested_and_both_verdicts_are_told():
     assert "excluded" in found.ranking.not_testable["sensor_drift"]
     assert found.without_context is not None
     assert found.without_context["sensor_drift"] > 0.5
-    facts = dict(judge_gap(gap_evidence(found)).facts)
-    assert facts["Put in"].startswith("Sensor drift excluded. Without that: sensor drift (")
+    facts = dict(gap_verdict(found).facts)
+    assert facts["Known beforehand"].startswith(
+        "Sensor drift excluded. Without this: sensor drift ("
+    )
     assert diagnose_once(case, 1, effects=CHOICE).without_context is None
 
 
@@ -215,7 +216,7 @@ def test_what_is_put_in_and_cannot_be_tested_is_said_to_change_nothing():
         sizes={"force_offset": {"offset": Size(mean=40.0, sd=5.0)}},
     )
     found = diagnose_once(replace(case, context=context), 1, effects=CHOICE)
-    put_in = dict(judge_gap(gap_evidence(found)).facts)["Put in"]
+    put_in = dict(gap_verdict(found).facts)["Known beforehand"]
     assert "offset 40 ± 5 kN" in put_in
     assert "rut rebound cannot be tested here (" in put_in
     assert any("force_offset is said to have offset 40 ± 5 kN" in note for note in found.warnings)

@@ -11,8 +11,8 @@ from calib.gap.case import Case
 from calib.gap.diagnose import diagnose
 from calib.gap.effects import EFFECTS
 from calib.gap.files import document
-from calib.report.gap_evidence import gap_verdict
 from calib.report.gap_verdict import Tone
+from calib.report.gap_words import gap_verdict
 from tests.gap.cases import PULL_ONLY, make_case
 
 FEW = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift", "lug_thrust")}

@@ -13,13 +13,9 @@ from calib.data import read_table
 from calib.gap.case import read_case
 from calib.gap.diagnose import diagnose
 from calib.gap.effects import EFFECTS
-from calib.gap.files import _parameters, document, write_diagnosis
-from calib.gap.fit import Fit
-from calib.gap.forward import Forward
-from calib.gap.hypotheses import Hypothesis
+from calib.gap.files import document, write_diagnosis
 from calib.gap.identifiability import NextMeasurement
 from calib.gap.mixture import Region
-from calib.inference.priors import Prior, Priors
 from tests.gap.cases import CHOICE, PULL_ONLY, diagnosis_of, make_case, pull_diagnosis, write_case
 
 
@@ -225,37 +221,6 @@ def test_conditions_are_told_by_ends_or_by_the_name_of_a_category():
         "separates": ["none", "unknown"], "gain_nats": 1.25,
         "conditions": {"operator": "Berg", "warmth": 0.0, "slip_ratio": 0.3},
     }]  # fmt: skip
-
-
-def test_parameters_are_told_in_their_own_units():
-    """A positive one's sd is that of its logarithm times its value; a fixed one has none."""
-    data = diagnosis_of("sensor_drift").data
-    entries = (
-        Prior("offset", "kN", "", "", "", False, 0.1, 0.2),
-        Prior("held", "1", "", "", "", False, 0.7, 0.0),
-        Prior("scale", "1", "", "", "", True, np.log(0.3), 0.4),
-    )
-    one = Hypothesis("force_offset", (EFFECTS["force_offset"],), (Priors(entries),))
-    two = replace(
-        one, effects=(*one.effects, EFFECTS["rate_effect"]),
-        effect_priors=(*one.effect_priors, Priors(entries[:1])),
-    )  # fmt: skip
-    for h in (one, two):
-        forward = Forward(data, h, dict.fromkeys(data.names, 0.1))
-        psi = np.array([p.loc for p in forward.priors.free])
-        variance = np.arange(1.0, psi.size + 1.0) ** 2
-        fit = Fit(forward, psi, np.diag(variance), {}, 0.0, 0.0, {})
-        sds = [np.sqrt(variance[part]) for part in forward.phi_slices]
-        wanted = {
-            "offset": (0.1, sds[0][0]), "held": (0.7, 0.0), "scale": (0.3, 0.3 * sds[0][1]),
-        }  # fmt: skip
-        if h is two:
-            wanted = {f"force_offset.{name}": value for name, value in wanted.items()}
-            wanted["rate_effect.offset"] = (0.1, sds[1][0])
-        told = _parameters(fit)
-        assert list(told) == list(wanted)
-        for name, (mean, sd) in wanted.items():
-            assert told[name] == pytest.approx({"mean": mean, "sd": sd}, rel=1e-12)
 
 
 def test_a_null_says_none():

@@ -12,6 +12,7 @@ from calib.data import table_from_arrays
 from calib.gap.campaigns import campaigns
 from calib.gap.case import Case
 from calib.gap.constants import COVERED, SHIFTS
+from calib.gap.describe import unlisted
 from calib.gap.diagnose import diagnose, diagnose_once
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.forward import Forward
@@ -33,7 +34,6 @@ from calib.gap.hypotheses import (
     with_case_effects,
     with_residual_discrepancy,
 )
-from calib.report.gap_sizes import size_sentences
 from tests.gap.cases import MODELS, NOISE, PULL_ONLY, campaigns_of, make_case, table_without
 
 SIGMA = {o: NOISE[o] for o in MODELS}
@@ -229,10 +229,9 @@ def test_nothing_sets_in_over_a_probe_that_stays_the_same():
 def test_a_soil_that_sets_hard_is_unlisted_and_said_to_change_with_its_water():
     found = diagnose(density_campaigns(step=0.06), 1)
     assert found.verdict == "unknown"
-    lead = size_sentences(found, "unknown")[0]
-    assert lead.startswith("what is missing sets in beyond a water content of")
-    assert 9.0 < float(lead.split(" of ")[1].split()[0]) < 11.0
-    assert lead.endswith("% of dry mass")
+    lead = unlisted(found)
+    assert (lead.over, lead.column) == ("water", "gravimetric_water_content")
+    assert 0.09 < lead.threshold[0] < 0.11
 
 
 def with_load(lab_kn: np.ndarray, field_kn: np.ndarray, exponent: float, seed: int = 3) -> Case:

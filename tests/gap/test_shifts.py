@@ -13,6 +13,7 @@ from calib.gap import discrepancy as module
 from calib.gap.campaigns import campaigns
 from calib.gap.constants import RADIUS_ERROR, SHIFT_DIFFERENCE
 from calib.gap.corrected import Corrected, load_corrected, predict_columns, save_corrected
+from calib.gap.describe import shifts
 from calib.gap.discrepancy import ZERO_OF_SLIP, another_soil, quantities
 from calib.gap.effects import EFFECTS
 from calib.gap.fit import Fit
@@ -23,7 +24,6 @@ from calib.gap.noise import Noise
 from calib.inference.mode import prior_widths
 from calib.inference.prior_files import default_priors
 from calib.models import MODELS as KNOWN
-from calib.report.page.diagnosis import shift_sizes
 from tests.gap.cases import MODELS, NOISE, PULL_ONLY, campaigns_of, make_case
 
 SIGMA = {o: NOISE[o] for o in MODELS}
@@ -145,14 +145,12 @@ def test_the_page_tells_the_shift_of_each_parameter_not_of_a_coordinate(data):
     assert shift is not None
     matrix = shift.parameters["drawbar_pull"]
     names = data.outputs[0].priors.names
-    sizes = shift_sizes(data.outputs, fit)
-    assert sizes[-1] == "together, as with another soil"
-    said = " ".join(sizes)
+    found = {p.name: p for p in shifts(data.outputs, fit)}
     for name in ("K_lo", "K_hi"):
         i = names.index(name)
         value = 100.0 * np.expm1(SIZE * matrix[i, 0])
-        found = next(float(s.split()[1]) for s in said.split("%") if s.split()[:1] == [name])
-        assert found == pytest.approx(value, rel=0.06)
+        assert found[name].mean == pytest.approx(value, rel=0.06)
+        assert found[name].unit == "percent"
 
 
 def test_a_shifted_soil_is_saved_and_loaded(data, tmp_path):
@@ -216,5 +214,5 @@ def test_the_page_tells_a_clear_shift_of_the_zero_of_slip(data):
     assert shift is not None
     psi = fit.psi.copy()
     psi[fit.forward.shift_slice] = 0.02 * shift.radius_error / np.square(shift.radius_error).sum()
-    sizes = shift_sizes(data.outputs, replace(fit, psi=psi, covariance=1e-8 * fit.covariance))
-    assert any(s.startswith("zero of slip 2.0") for s in sizes)
+    sizes = shifts(data.outputs, replace(fit, psi=psi, covariance=1e-8 * fit.covariance))
+    assert next(p.mean for p in sizes if not p.name) == pytest.approx(2.0)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from scipy.stats import beta
 
-from calib.gap.files import track_record
+from calib.gap.document import track_record
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORDS = ROOT / "calib" / "gap" / "track_record.toml"

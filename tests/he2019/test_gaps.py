@@ -42,7 +42,8 @@ from calib.inference.sampler import SamplerSettings
 from calib.models import get_model
 from calib.models.magic_formula import magic_formula
 from calib.models.soil import rut_depth as eq_21
-from calib.report.gap_facts import output_rows, short_name
+from calib.report.figures.gap import output_rows
+from calib.report.gap_words import short_name
 from calib.report.labels import odds_text, short
 from calib.report.sections import Report
 from calib.report.study import Study
@@ -500,7 +501,7 @@ def test_errors_before_and_after_are_drawn_with_units_and_a_key(found_gaps, name
     plate = gap_plate(result)
     assert plate.figure is not None
     before, after, which = plate.figure.axes
-    own = output_rows(result.found)[0]
+    own = output_rows(result.document)[0]
     for ax, predicted in ((before, own.before), (after, own.after)):
         drawn = np.concatenate(
             [line.get_ydata() for line in ax.lines if line.get_marker() not in ("None", "", None)]
@@ -527,6 +528,6 @@ def test_errors_before_and_after_are_drawn_with_units_and_a_key(found_gaps, name
 
 def test_the_caption_tells_the_errors(found_gaps):
     result = found_gaps["plain_bekker"]
-    own = output_rows(result.found)[0]
+    own = output_rows(result.document)[0]
     rms = float(np.sqrt(np.mean((own.measured - own.before) ** 2)))
     assert f"{rms:.1f} mm rms" in gap_plate(result).caption

@@ -40,6 +40,7 @@ from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 from calib.gap.batch import written
 from calib.gap.case import Case, case_files, read_case
+from calib.gap.describe import gap_document
 from calib.gap.diagnose import Diagnosis, diagnose
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.effects.user import load_effects
@@ -286,7 +287,7 @@ def _diagnose(item: DiagnosisItem, seed: int) -> Work:
         found = diagnose(case, seed, effects={**EFFECTS, **own})
         files: dict[str, str | bytes] = {**written(found, effects)}
         if page:
-            files |= files_of(lambda folder: write_page(found, folder, {"seed": seed}))
+            files |= files_of(lambda folder: write_page(gap_document(found), folder))
     numbers = diagnosis_numbers(found)
     if case.label:
         numbers["data_label"] = case.label

@@ -1,20 +1,30 @@
-"""Figures of a diagnosis: what a design can tell apart, which cause it is, and what each leaves."""
+"""Figures of a diagnosis, from its document: what the design shows, where, which, how far."""
 
 from __future__ import annotations
 
 import textwrap
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch, Rectangle
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
 from scipy.cluster.hierarchy import leaves_list, linkage
 from scipy.spatial.distance import squareform
 
-from calib.gap.constants import ALIKE, NAMED
-from calib.gap.diagnose import Diagnosis, Placebo, placebos
-from calib.gap.identifiability import Identifiability
-from calib.report.figures.gap_where import conditions_plate, how_far_plate, where_plate
+from calib.data.quantities import columns_of, role_of
+from calib.gap.constants import ALIKE
+from calib.gap.document import Design, GapDocument
+from calib.gap.mixture import Region
+from calib.models.base import Array
 from calib.report.figures.plate import Plate, draw_all, marked
 from calib.report.figures.style import (
     BLACK,
@@ -31,92 +41,265 @@ from calib.report.figures.style import (
     note,
     panels,
 )
-from calib.report.gap_facts import TIE, output_word, short_name
-from calib.report.labels import MINUS, NO_UNIT, axis_of, joined, percent, short
+from calib.report.gap_verdict import TIE
+from calib.report.gap_words import Notation, Words, chance, short_name
+from calib.report.labels import MINUS, NO_UNIT, Axis, axis_of, percent_range, short, units_of
 
-
-def left_over_plate(found: Diagnosis) -> Plate:
-    """Draw standardised residuals of the best hypothesis over slip and run order."""
-    name = found.ranking.order[0]
-    fit = found.ranking.best(name)
-    conditions = found.data.view.conditions
-    known = (found.data.view.column(role) for role in ("slip", "order"))
-    columns = [c for c in known if c]
-    columns = columns or [next(iter(conditions))]
-    fig, axes = panels(
-        1, len(columns), height=44.0, left=13.0, right=4.0, top=6.0, bottom=16.0, gap_x=6.0,
-        sharey=True,
-    )  # fmt: skip
-    handles = {}
-    beyond = total = 0
-    top = 2.6
-    for ax, column in zip(axes[0], columns, strict=True):
-        axis = axis_of(column)
-        ax.axhspan(-2.0, 2.0, color="#eeeeee", lw=0.0, zorder=0)
-        ax.axhline(0.0, color=GREY, lw=0.6)
-        for k, o in enumerate(found.data.outputs):
-            residual = fit.field_residuals[o.name]
-            (handles[output_word(o.name)],) = ax.plot(
-                axis.scale(conditions[column][o.rows]), residual, MARKERS[k], color=CYCLE[k],
-                mec="white", mew=0.4, ms=4.6,
-            )  # fmt: skip
-            top = max(top, 1.1 * float(np.nanmax(np.abs(residual))))
-        ax.set_xlabel(axis.label)
-        ax.set_title(f"Along {axis.name.lower()}", loc="left")
-    for residual in fit.field_residuals.values():
-        beyond, total = beyond + int((np.abs(residual) > 2.0).sum()), total + residual.size
-    axes[0, 0].set_ylim(-top, top)
-    axes[0, 0].set_ylabel("Residual (noise sd)")
-    legend_below(fig, handles, 3)
-    share = percent(beyond / max(total, 1)) if beyond else "none"
-    caption = (
-        f"Residuals of the field rows after {short_name(name)}, the most probable hypothesis: "
-        f"{beyond} of {total} lie beyond 2 sds of the noise of both campaigns ({share}; 4.6 % "
-        "are expected). A pattern left here would be a second effect, or the wrong first one."
-    )
-    return Plate(fig, "left_over", caption, "What is left after the best hypothesis")
-
-
-_MOST = 8
+_BAND, _PALE = "#e6e6e6", "#c9c9c9"
+# White to dark: how probable it is that a gap exceeds the noise. It survives greyscale.
+_PROBABLE = LinearSegmentedColormap.from_list("probable", ["#ffffff", "#f6c9a5", "#D55E00"])
+_NORM = Normalize(0.0, 1.0)
+# Half the width of a 90 % interval, in sds.
+_Z = 1.64
+# How many are shown.
+_MOST_HYPOTHESES, _MOST_CONDITIONS, _MOST_PRESSURES = 8, 6, 4
 _SPECIAL = ("none", "unknown", "parameter_shift")
 
 
-def in_play(found: Diagnosis) -> list[str]:
-    """Return hypotheses whose probability is not far below the best one's, best first."""
-    p, order = found.ranking.probability, found.ranking.order
-    return [name for name in order if p[name] >= TIE * p[order[0]]][:_MOST]
+@dataclass(frozen=True)
+class OutputRows:
+    """Field rows of one output on the scale of its axis, arrays of shape (n,).
+
+    The reading, the calibrated simulator before and the corrected one after; the sd of a reading;
+    truth minus simulator, its sd, and the probability that it exceeds the noise.
+    """
+
+    name: str
+    axis: Axis
+    rows: NDArray[np.int64]
+    measured: Array
+    before: Array
+    after: Array
+    noise: Array
+    gap: Array
+    sd: Array
+    probability: Array
+
+    @property
+    def likely(self) -> int:
+        """How many rows probably have a gap."""
+        return int((self.probability > 0.5).sum())
+
+    @property
+    def noise_median(self) -> float:
+        """Median of the noise."""
+        return float(np.median(self.noise))
+
+    @property
+    def largest(self) -> tuple[float, float, float] | None:
+        """The largest gap with its 90 % interval; None where no row shows any."""
+        row = int(np.abs(self.gap).argmax())
+        gap, half = float(self.gap[row]), _Z * float(self.sd[row])
+        shows = abs(gap) + half >= 0.02 * self.noise_median
+        return (gap, gap - half, gap + half) if shows else None
 
 
-def probability_text(p: float) -> str:
-    """Write a probability as a percentage without claiming certainty."""
-    if p > 0.995:
-        return "> 99 %"
-    return "< 1 %" if p < 0.01 else f"{100.0 * p:.0f} %"
+def output_rows(d: GapDocument) -> list[OutputRows]:
+    """Return the field rows of every output, as they are drawn."""
+    gathered = []
+    for o in d.outputs:
+        axis = Notation(d).axis(o.name)
+        values = (o.measured, o.before, o.after, o.noise_sd, o.gap, o.gap_sd)
+        measured, before, after, noise, gap, sd = (axis.scale(np.array(v)) for v in values)
+        gathered.append(
+            OutputRows(
+                o.name, axis, np.array(o.rows), measured, before, after, noise, gap, sd,
+                np.array(o.probability),
+            )
+        )  # fmt: skip
+    return gathered
 
 
-def which_plate(found: Diagnosis) -> Plate:
-    """Draw probabilities beside the misfit that each hypothesis leaves."""
-    p = found.ranking.probability
-    order = found.ranking.order
-    names = order[:_MOST]
-    names += [n for n in _SPECIAL if n in p and n not in names]
-    tied = in_play(found)
+def _column(d: GapDocument, *roles: str) -> str | None:
+    """Return the first recorded condition of some physical roles."""
+    return next((c for role in roles for c in columns_of(role) if c in d.conditions), None)
+
+
+def _abscissa(d: GapDocument) -> str:
+    return _column(d, "slip", "order") or next(iter(d.conditions))
+
+
+def panel_groups(
+    d: GapDocument, rows: NDArray[np.int64]
+) -> list[tuple[str, NDArray[np.bool_]]]:  # fmt: skip
+    """Split rows by inflation pressure into a few panels: titles and masks."""
+    column = _column(d, "pressure")
+    pressure = np.array(d.conditions[column]) if column else np.zeros(1)
+    if column is None or np.ptp(pressure) == 0.0:
+        return [("", np.ones(rows.size, dtype=np.bool_))]
+    distinct, axis = np.unique(pressure), axis_of(column)
+    if distinct.size <= _MOST_PRESSURES:
+        return [(f"{axis.value_text(p)} {axis.unit}", pressure[rows] == p) for p in distinct]
+    edges = np.quantile(pressure, [0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0])
+    groups = []
+    for low, high in pairwise(edges):
+        inside = (pressure[rows] >= low) & (pressure[rows] <= high)
+        if low > edges[0]:
+            inside &= pressure[rows] > low
+        groups.append((axis.range_text(np.array([low, high])), inside))
+    return groups
+
+
+# Where
+
+
+def where_plate(d: GapDocument, say: Words) -> Plate:
+    """Draw the gap over slip, a panel for each inflation pressure."""
+    outputs = output_rows(d)
+    columns = max(len(panel_groups(d, o.rows)) for o in outputs)
+    fig, axes = panels(
+        len(outputs), columns, height=44.0, left=16.0, right=4.0, top=6.0, bottom=25.0, gap_x=5.0,
+        gap_y=7.0, sharex=True, sharey="row",
+    )  # fmt: skip
+    name, slip = _abscissa(d), _column(d, "slip") or ""
+    x_axis = axis_of(name)
+    x = x_axis.scale(np.array(d.conditions[name]))
+    for i, (row, own) in enumerate(zip(axes, outputs, strict=True)):
+        limits = _limits(own)
+        marked = [r for r in d.regions if r.output == own.name and slip in r.conditions][:1]
+        for ax, (title, mask) in zip(row, panel_groups(d, own.rows), strict=True):
+            _noise_band(ax, x[own.rows][mask], own.noise[mask])
+            for region in marked:
+                _span(ax, region, x_axis, np.array(d.conditions[slip]))
+            _points(ax, x[own.rows][mask], own, mask)
+            ax.set_ylim(*limits)
+            if limits[1] > 0.01:
+                ax.ticklabel_format(axis="y", style="plain")
+            if i == 0:
+                ax.set_title(title, loc="left", fontweight="bold")
+            if i == len(outputs) - 1:
+                ax.set_xlabel(x_axis.label)
+        row[0].set_ylabel(f"Gap in {say.n.output(own.name)} ({own.axis.unit})")
+    _key(fig, regions=any(slip in r.conditions for r in d.regions))
+    return Plate(fig, "where", say("caption_where", outputs), "Where: the gap over slip")
+
+
+def conditions_plate(d: GapDocument, say: Words) -> Plate | None:
+    """Draw the gap in noise sds over every condition that varies, with regions marked."""
+    order = list(d.conditions)
+    names = [n for n in order if np.ptp(d.conditions[n]) > 0.0]
+    if {"pressure", "ground_pressure"} <= {role_of(n) for n in names}:
+        names = [n for n in names if role_of(n) != "ground_pressure"]
+    # A condition with a region in it must not be left out.
+    marked = {key for r in d.regions for key in r.conditions}
+    names = sorted(names, key=lambda n: n not in marked)[:_MOST_CONDITIONS]
+    names.sort(key=order.index)
+    if not names:
+        return None
+    outputs = output_rows(d)
+    fig, axes = panels(
+        len(outputs), len(names), height=34.0, left=19.0, right=4.0, top=4.0, bottom=28.0,
+        gap_x=3.0, gap_y=5.0, sharex="col", sharey="row",
+    )  # fmt: skip
+    for i, (row, own) in enumerate(zip(axes, outputs, strict=True)):
+        ones = np.ones_like(own.noise)
+        scaled = replace(own, noise=ones, gap=own.gap / own.noise, sd=own.sd / own.noise)
+        for ax, name in zip(row, names, strict=True):
+            axis, values = axis_of(name), np.array(d.conditions[name])
+            ax.axhspan(-1.0, 1.0, color=_BAND, lw=0.0, zorder=0)
+            for region in d.regions:
+                if region.output == own.name and name in region.conditions:
+                    _span(ax, region, axis, values)
+            _points(ax, axis.scale(values[own.rows]), scaled, ones > 0.0)
+            ax.set_ylim(*_limits(scaled))
+            if i == len(outputs) - 1:
+                levels = d.covariates.get(name)
+                ax.set_xlabel(axis.name if levels else f"{axis.name}\n({axis.unit})")
+                if levels:
+                    ax.set_xticks(range(len(levels)), levels, rotation=90)
+                    continue
+                ax.xaxis.set_major_locator(MaxNLocator(3))
+                ax.ticklabel_format(axis="x", style="plain", useOffset=False)
+        row[0].set_ylabel(f"Gap in {say.n.output(own.name)}\n(noise sd)")
+    _key(fig, regions=bool(d.regions))
+    caption = say("caption_where_conditions")
+    return Plate(fig, "where_conditions", caption, "Where: the gap over conditions")
+
+
+def _limits(own: OutputRows) -> tuple[float, float]:
+    """Room for all bars, and for two noise sds to either side."""
+    least = 2.0 * float(own.noise.mean())
+    low = min(float((own.gap - _Z * own.sd).min()), -least)
+    high = max(float((own.gap + _Z * own.sd).max()), least)
+    return low - 0.06 * (high - low), high + 0.08 * (high - low)
+
+
+def _noise_band(ax: Axes, x: Array, noise: Array, width: float = 1.0) -> None:
+    """Shade the noise about zero; a straight line through the rows' own, as noise may grow."""
+    if not x.size:
+        return
+    ends = np.array([x.min(), x.max()])
+    level = np.full(2, width * noise.mean())
+    if np.ptp(x) > 0.0 and x.size > 2:
+        level = width * np.polyval(np.polyfit(x, noise, 1), ends)
+    ax.fill_between(ends, -level, level, color=_BAND, lw=0.0, zorder=0)
+    ax.axhline(0.0, color=GREY, lw=0.6, zorder=1)
+
+
+def _span(ax: Axes, region: Region, axis: Axis, values: Array) -> None:
+    low, high = (float(v) for v in axis.scale(np.array(next(iter(region.conditions.values())))))
+    # A region at a single value still needs a width.
+    least = 0.03 * float(np.ptp(axis.scale(values)))
+    if high - low < least:
+        low, high = low - 0.5 * least, high + 0.5 * least
+    ax.axvspan(low, high, facecolor=ORANGE, alpha=0.13, lw=0.0, zorder=0)
+    ax.plot(
+        [low, high], [0.985, 0.985], transform=ax.get_xaxis_transform(), color=VERMILION, lw=2.2,
+        solid_capstyle="butt", clip_on=False,
+    )  # fmt: skip
+
+
+def _points(ax: Axes, x: Array, own: OutputRows, mask: NDArray[np.bool_]) -> None:
+    ax.axhline(0.0, color=GREY, lw=0.6, zorder=1)
+    ax.errorbar(
+        x, own.gap[mask], _Z * own.sd[mask], fmt="none", ecolor=BLACK, elinewidth=0.6, zorder=2
+    )
+    ax.scatter(
+        x, own.gap[mask], c=own.probability[mask], cmap=_PROBABLE, norm=_NORM, s=20.0,
+        edgecolors=BLACK, linewidths=0.6, zorder=3,
+    )  # fmt: skip
+
+
+def _key(fig: Figure, *, regions: bool) -> None:
+    """Put the colour scale and the meaning of the shades at the foot, below the axis labels."""
+    height = fig.get_figheight() * 25.4
+    bar = fig.add_axes((0.56, 7.0 / height, 0.28, 2.4 / height))
+    scale = fig.colorbar(ScalarMappable(_NORM, _PROBABLE), cax=bar, orientation="horizontal")
+    scale.set_ticks([0.0, 0.5, 1.0])
+    scale.outline.set_linewidth(0.5)
+    bar.set_title(f"Probability that the gap exceeds the noise ({NO_UNIT})", fontsize=7.0, pad=2.5)
+    handles = [Patch(color=_BAND), Patch(facecolor="#fdf3dc", edgecolor=VERMILION, lw=0.8)]
+    labels = ["±1 noise sd of a single reading", "region with a probable gap"]
+    shown = 2 if regions else 1
+    fig.legend(
+        handles[:shown], labels[:shown], loc="lower left", ncols=1, labelspacing=0.4,
+        bbox_to_anchor=(0.09, 2.5 / height), borderaxespad=0.0,
+    )  # fmt: skip
+
+
+# Which
+
+
+def which_plate(d: GapDocument, say: Words) -> Plate:
+    """Draw the probabilities of the hypotheses."""
+    shown = [e for i, e in enumerate(d.explanations) if i < _MOST_HYPOTHESES or e.name in _SPECIAL]
+    tied = [e for e in shown[:_MOST_HYPOTHESES] if e.probability >= TIE * d.best.probability]
     # As wide as the margin: longer names, of several causes at once, take two lines or three.
-    labels = [textwrap.fill(short_name(n), 38) for n in names]
+    labels = [textwrap.fill(short_name(e.name), 38) for e in shown]
     rows = np.maximum(1.0, [0.66 * (1 + label.count("\n")) for label in labels])
     total = float(rows.sum())
     fig, axes = panels(1, 1, height=5.2 * total + 3.0, left=66.0, right=16.0, top=3.0, bottom=10.0)
     ax = axes[0, 0]
     y = total - np.cumsum(rows) + 0.5 * rows
-    for yi, name in zip(y, names, strict=True):
-        leading = name in tied
-        colour = (BLUE if name == order[0] else SKY) if leading else "#c9c9c9"
+    for yi, e in zip(y, shown, strict=True):
+        leading = e in tied
         ax.barh(
-            yi, p[name], color=colour, height=0.66, edgecolor=BLACK if leading else "none", lw=0.5,
+            yi, e.probability, edgecolor=BLACK if leading else "none", lw=0.5, height=0.66,
+            color=BLUE if e is d.best else SKY if leading else _PALE,
             hatch="///" if leading and len(tied) > 1 else None,
         )  # fmt: skip
         ax.text(
-            p[name] + 0.01, yi, probability_text(p[name]), va="center", fontsize=7.0,
+            e.probability + 0.01, yi, chance(e.probability), va="center", fontsize=7.0,
             fontweight="bold" if leading else "normal",
         )  # fmt: skip
     ax.set_yticks(y, labels, linespacing=0.95)
@@ -126,126 +309,102 @@ def which_plate(found: Diagnosis) -> Plate:
     ax.tick_params(axis="y", length=0.0)
     ax.set_xlabel(f"Probability ({NO_UNIT})")
     if len(tied) > 1:
-        read = "read them as a tie" if p[order[0]] < NAMED else "any of them may be right"
+        read = "read them as a tie" if d.best.probability < 0.5 else "any of them may be right"
         note(ax, f"hatched: not far apart,\n{read}", x=0.98, y=0.05, color=BLACK)
-    return Plate(fig, "which", _which_caption(found, tied), "Which: the hypotheses")
+    others = d.explanations[_MOST_HYPOTHESES:]
+    rest = sum(e.probability for e in others if e.name not in _SPECIAL)
+    caption = say("caption_which", tied, len(others), rest)
+    return Plate(fig, "which", caption, "Which: the hypotheses")
 
 
-def _which_caption(found: Diagnosis, tied: list[str]) -> str:
-    p, order = found.ranking.probability, found.ranking.order
-    listed = joined([f"{short_name(n)} ({probability_text(p[n])})" for n in tied])
-    text = (
-        f"Most probable: {listed}."
-        if len(tied) == 1
-        else f"No data here separate {listed} by more than a factor of {1.0 / TIE:.0f}."
-    )
-    rest = sum(p[n] for n in order[_MOST:] if n not in _SPECIAL)
-    others = len(order) - min(len(order), _MOST)
-    if others:
-        text += f" {others} more hypotheses share {probability_text(rest)}."
-    return (
-        f"{text} Beyond the dashed line a hypothesis is more probable than all others together; "
-        "how probable each cause is to act, in whichever of them, is a table of its own."
-    )
+def left_over_plate(d: GapDocument, say: Words) -> Plate:
+    """Draw standardised residuals of the best hypothesis over slip and run order."""
+    columns = [c for role in ("slip", "order") if (c := _column(d, role))] or [_abscissa(d)]
+    fig, axes = panels(
+        1, len(columns), height=44.0, left=13.0, right=4.0, top=6.0, bottom=16.0, gap_x=6.0,
+        sharey=True,
+    )  # fmt: skip
+    handles = {}
+    for ax, column in zip(axes[0], columns, strict=True):
+        axis, values = axis_of(column), np.array(d.conditions[column])
+        ax.axhspan(-2.0, 2.0, color="#eeeeee", lw=0.0, zorder=0)
+        ax.axhline(0.0, color=GREY, lw=0.6)
+        for k, o in enumerate(d.outputs):
+            (handles[say.n.output(o.name)],) = ax.plot(
+                axis.scale(values[list(o.rows)]), o.residual, MARKERS[k], color=CYCLE[k],
+                mec="white", mew=0.4, ms=4.6,
+            )  # fmt: skip
+        ax.set_xlabel(axis.label)
+        ax.set_title(f"Along {axis.name.lower()}", loc="left")
+    sizes = np.abs(np.concatenate([o.residual for o in d.outputs]))
+    top = max(2.6, 1.1 * float(np.nanmax(sizes)))
+    axes[0, 0].set_ylim(-top, top)
+    axes[0, 0].set_ylabel("Residual (noise sd)")
+    legend_below(fig, handles, 3)
+    caption = say("caption_left_over", int((sizes > 2.0).sum()), sizes.size)
+    return Plate(fig, "left_over", caption, "What is left after the best hypothesis")
 
 
-def placebo_plate(found: Diagnosis) -> Plate:
+def placebo_plate(d: GapDocument, say: Words) -> Plate:
     """Draw what wrong hypotheses would have left of the gap."""
-    placebo = placebos(found)
-    order = sorted(placebo.left, key=lambda n: placebo.left[n])
-    named = found.ranking.order[0]
+    left = {e.name: e.left for e in d.explanations if e.left is not None}
+    order = sorted(left, key=lambda name: left[name])
+    removed = {name: 1.0 - value / d.before for name, value in left.items()}
     fig, axes = panels(
         1, 1, height=4.2 * len(order) + 3.0, left=62.0, right=16.0, top=7.0, bottom=10.0
     )
     ax = axes[0, 0]
     y = np.arange(len(order))[::-1]
     for yi, name in zip(y, order, strict=True):
-        best = name == named
+        best = name == d.best.name
         colour = BLUE if best else ORANGE if name in ("unknown", "parameter_shift") else GREY
-        ax.plot([placebo.left[name], placebo.before], [yi, yi], color="#d4d4d4", lw=1.0, zorder=1)
-        ax.plot(
-            placebo.left[name], yi, "D" if best else "o", color=colour, ms=5.5 if best else 4.0,
-            zorder=3,
-        )  # fmt: skip
+        ax.plot([left[name], d.before], [yi, yi], color="#d4d4d4", lw=1.0, zorder=1)
+        ax.plot(left[name], yi, "D" if best else "o", color=colour, ms=5.5 if best else 4.0,
+                zorder=3)  # fmt: skip
         ax.text(
-            1.015, yi, f"{100.0 * placebo.shrink(name):.0f} %".replace("-", MINUS),
-            transform=ax.get_yaxis_transform(), va="center", fontsize=7.0,
+            1.015, yi, f"{100.0 * removed[name]:.0f} %".replace("-", MINUS), fontsize=7.0,
+            transform=ax.get_yaxis_transform(), va="center",
             fontweight="bold" if best else "normal",
         )  # fmt: skip
     ax.axvline(1.0, color=BLACK, lw=0.8, ls=(0, (1, 1)), zorder=0)
-    ax.axvline(placebo.before, color=VERMILION, lw=1.0, zorder=0)
-    high = max(placebo.before, *placebo.left.values())
-    low = min(1.0, *placebo.left.values())
+    ax.axvline(d.before, color=VERMILION, lw=1.0, zorder=0)
+    high, low = max(d.before, *left.values()), min(1.0, *left.values())
     pad = 0.06 * max(high - low, 0.3)
     ax.set_xlim(low - pad, high + pad)
     top = len(order) - 0.3
     ax.text(1.0, top, "noise", ha="center", va="bottom", fontsize=7.0)
-    if placebo.before - 1.0 > 0.12 * (high - low + 2.0 * pad):
-        ax.text(placebo.before, top, "simulator", ha="center", va="bottom", fontsize=7.0,
-                color=EMBER)  # fmt: skip
+    if d.before - 1.0 > 0.12 * (high - low + 2.0 * pad):
+        ax.text(d.before, top, "simulator", ha="center", va="bottom", fontsize=7.0, color=EMBER)
     ax.text(1.015, 1.0, "removed", transform=ax.transAxes, va="bottom", fontsize=7.0, color=GREY)
-    ax.set_yticks(y, [textwrap.fill(short_name(n), 38) for n in order], linespacing=0.85)
+    ax.set_yticks(y, [textwrap.fill(short_name(name), 38) for name in order], linespacing=0.85)
     ax.set_ylim(-0.6, len(order) - 0.4)
     ax.tick_params(axis="y", length=0.0)
     ax.set_xlabel("Residual on the field rows, rms over the noise (noise sd)")
-    return Plate(fig, "placebo", _placebo_caption(placebo, named), "Placebo: the wrong hypotheses")
+    runner = next((name for name in order if name not in (*_SPECIAL, d.best.name)), None)
+    shown = {name: max(part, 0.0) for name, part in removed.items()}
+    caption = say("caption_placebo", shown, runner)
+    return Plate(fig, "placebo", caption, "Placebo: the wrong hypotheses")
 
 
-def _placebo_caption(placebo: Placebo, named: str) -> str:
-    wrong = {
-        n: v
-        for n, v in placebo.left.items()
-        if n not in ("none", "unknown", "parameter_shift", named)
-    }
-    text = (
-        f"On the rows they were fitted to, {short_name(named)} removes "
-        f"{percent(max(placebo.shrink(named), 0.0))} of the misfit"
-    )
-    if wrong:
-        runner = min(wrong, key=lambda n: wrong[n])
-        text += (
-            f", and the best single effect besides, {short_name(runner)}, "
-            f"{percent(max(placebo.shrink(runner), 0.0))}"
-        )
-    if "unknown" in placebo.left and named != "unknown":
-        text += (
-            ". Something unlisted, which is free to follow whatever is there, removes "
-            f"{percent(max(placebo.shrink('unknown'), 0.0))}"
-        )
-    if "none" in placebo.left:
-        text += (
-            f". Without any effect, {short_name('none')}, "
-            f'{percent(max(placebo.shrink("none"), 0.0))} go: the line "simulator" is the model '
-            "as the laboratory alone calibrated it, and every hypothesis, that of no gap too, "
-            "estimates the model's parameters anew from both campaigns, which lets those that the "
-            "laboratory left uncertain follow the field. What an effect adds to that is its own"
-        )
-    return (
-        f"{text}. Any hypothesis with free parameters removes something, a wrong one too, so the "
-        "distance between the diamond and the rest is what counts, not the percentage. Where that "
-        "is small, causes are told apart by what their sizes and numbers cost, not by the fit; "
-        "noise alone would leave "
-        f"{short(1.0)}."
-    )
+# What the design shows
 
 
-def isolability_plate(found: Diagnosis) -> Plate | None:
-    """Draw the likeness of effects, what parameters absorb, and detectable sizes."""
-    design = found.ranking.identifiability
+def isolability_plate(d: GapDocument, say: Words) -> Plate | None:
+    """Draw the similarity of effects, what parameters absorb, and detectable sizes."""
+    design = d.design
     if not design.absorbed:
         return None
     names = _ordered(design)
     n = len(names)
     side = max(5.0 * n, 30.0)
-    words = [textwrap.fill(short_name(name), _LINE) for name in names]
-    # Names stand to the left of the matrix and, turned, below it.
-    margin = 5.0 + _MM_PER_LETTER * max(len(line) for w in words for line in w.splitlines())
+    words = [textwrap.fill(short_name(name), 27) for name in names]
+    # Names stand to the left of the matrix and, turned, below it: 1.45 mm a letter.
+    margin = 5.0 + 1.45 * max(len(line) for w in words for line in w.splitlines())
     bottom = max(margin, 14.0)
     fig, axes = panels(
         1, 3, height=side, left=margin, right=4.0, top=6.0, bottom=bottom, gap_x=6.0, sharey=False
     )
-    total = fig.get_figwidth() * 25.4
-    height = fig.get_figheight() * 25.4
+    total, height = fig.get_figwidth() * 25.4, fig.get_figheight() * 25.4
     # The matrix is square; the two strips share its rows.
     width = min(side, 86.0)
     strip = 0.5 * (total - margin - 4.0 - 16.0 - width)
@@ -253,55 +412,57 @@ def isolability_plate(found: Diagnosis) -> Plate | None:
     for ax, w in zip(axes[0], (width, strip, strip), strict=True):
         ax.set_position((left / total, bottom / height, w / total, side / height))
         left += w + 8.0
-    _matrix(axes[0, 0], design, names, words)
+    matrix, absorbed, smallest = axes[0]
+    _matrix(matrix, design, names, words)
     y = np.arange(n)
-    absorbed = np.array([design.absorbed[name] for name in names])
-    axes[0, 1].barh(y, absorbed, color=ORANGE, height=0.6)
-    axes[0, 1].set_xlim(0.0, 1.0)
-    axes[0, 1].set_xlabel(f"Absorbed by the\nparameters ({NO_UNIT})")
+    absorbed.barh(y, [design.absorbed[name] for name in names], color=ORANGE, height=0.6)
+    absorbed.set_xlim(0.0, 1.0)
+    absorbed.set_xlabel(f"Absorbed by the\nparameters ({NO_UNIT})")
     size = np.array([design.detectable[name] for name in names])
     shown = np.minimum(size, 4.0)
-    axes[0, 2].hlines(y, 0.0, shown, color="#c9c9c9", lw=1.0)
-    axes[0, 2].plot(shown, y, "o", color=BLUE, ms=4.5)
-    for yi, value in zip(y, size, strict=True):
-        axes[0, 2].text(
-            min(value, 4.0) + 0.12, yi, short(float(value)) if value < 100.0 else "none",
-            va="center", fontsize=SMALLEST_PT,
-        )  # fmt: skip
-    axes[0, 2].set_xlim(0.0, max(1.25 * float(shown.max()), 1.5))
-    axes[0, 2].set_xlabel("Smallest size that\nshows (noise sd)")
-    for ax in axes[0, 1:]:
+    smallest.hlines(y, 0.0, shown, color=_PALE, lw=1.0)
+    smallest.plot(shown, y, "o", color=BLUE, ms=4.5)
+    for yi, x, value in zip(y, shown, size, strict=True):
+        text = short(float(value)) if value < 100.0 else "none"
+        smallest.text(x + 0.12, yi, text, va="center", fontsize=SMALLEST_PT)
+    smallest.set_xlim(0.0, max(1.25 * float(shown.max()), 1.5))
+    smallest.set_xlabel("Smallest size that\nshows (noise sd)")
+    for ax in (absorbed, smallest):
         ax.set_ylim(n - 0.5, -0.5)
         ax.set_yticks([])
         ax.spines["left"].set_visible(False)
         ax.hlines(y + 0.5, *ax.get_xlim(), color="#eeeeee", lw=0.5, zorder=0)
-    axes[0, 0].set_title("Likeness (cosine)", loc="left")
-    return Plate(fig, "isolability", _design_caption(design), "What this design can tell apart")
+    matrix.set_title("Similarity (cosine)", loc="left")
+    hard = [name for name, share in design.absorbed.items() if share > 0.8]
+    finite = [float(v) for v in size if np.isfinite(v)]
+    cosine = {(a, b): value for a, b, value in design.likeness}
+    alike = sorted(design.alike, key=lambda pair: -cosine[pair])
+    caption = say("caption_isolability", hard, finite and (min(finite), max(finite)), alike)
+    return Plate(fig, "isolability", caption, "What this design can distinguish")
 
 
-def _matrix(ax: Axes, design: Identifiability, names: list[str], words: list[str]) -> None:
+def _matrix(ax: Axes, design: Design, names: list[str], words: list[str]) -> None:
     n = len(names)
+    known = {frozenset((a, b)): value for a, b, value in design.likeness}
     cosine = np.full((n, n), np.nan)
     for i, a in enumerate(names):
         for j, b in enumerate(names[:i]):
-            cosine[i, j] = design.cosine_similarity.get(_key(a, b), np.nan)
+            cosine[i, j] = known.get(frozenset((a, b)), np.nan)
     ax.imshow(cosine, vmin=0.0, vmax=1.0, cmap="Blues", aspect="auto")
-    for i in range(n):
-        for j in range(i):
-            value = cosine[i, j]
-            if not np.isfinite(value):
-                continue
-            alike = value >= ALIKE
-            ax.text(
-                j, i, f"{100.0 * value:.0f}", ha="center", va="center", fontsize=SMALLEST_PT,
-                color="white" if value > 0.6 else BLACK, fontweight="bold" if alike else "normal",
-            )  # fmt: skip
-            if alike:
-                ax.plot(
-                    [j - 0.5, j + 0.5, j + 0.5, j - 0.5, j - 0.5],
-                    [i - 0.5, i - 0.5, i + 0.5, i + 0.5, i - 0.5], color=VERMILION, lw=1.1,
-                    clip_on=False, zorder=4,
-                )  # fmt: skip
+    for i, j in np.argwhere(np.isfinite(cosine)):
+        value = cosine[i, j]
+        alike = value >= ALIKE
+        ax.text(
+            j, i, f"{100.0 * value:.0f}", ha="center", va="center", fontsize=SMALLEST_PT,
+            color="white" if value > 0.6 else BLACK, fontweight="bold" if alike else "normal",
+        )  # fmt: skip
+        if alike:
+            corner = (j - 0.5, i - 0.5)
+            ax.add_patch(
+                Rectangle(
+                    corner, 1.0, 1.0, fill=False, ec=VERMILION, lw=1.1, clip_on=False, zorder=4
+                )
+            )
     ax.set_yticks(np.arange(n), words, linespacing=0.95)
     shown = max(n - 1, 1)
     ax.set_xticks(np.arange(shown), words[:shown], rotation=90, linespacing=0.95)
@@ -311,51 +472,108 @@ def _matrix(ax: Axes, design: Identifiability, names: list[str], words: list[str
         spine.set_visible(False)
 
 
-def _key(a: str, b: str) -> tuple[str, str]:
-    return (a, b) if a < b else (b, a)
-
-
-def _ordered(design: Identifiability) -> list[str]:
+def _ordered(design: Design) -> list[str]:
     """Names with those that look alike beside each other."""
     names = sorted(design.absorbed)
     if len(names) < 3:
         return names
-    distance = np.zeros((len(names), len(names)))
-    for i, a in enumerate(names):
-        for j, b in enumerate(names[:i]):
-            cosine = design.cosine_similarity.get((b, a), 0.0)
-            distance[i, j] = distance[j, i] = np.clip(1.0 - cosine, 0.0, 2.0)
+    at = {name: i for i, name in enumerate(names)}
+    distance = np.ones((len(names), len(names)))
+    np.fill_diagonal(distance, 0.0)
+    for a, b, value in design.likeness:
+        distance[at[a], at[b]] = distance[at[b], at[a]] = np.clip(1.0 - value, 0.0, 2.0)
     tree = linkage(squareform(distance, checks=False), "average", optimal_ordering=True)
     return [names[i] for i in leaves_list(tree)]
 
 
-def _design_caption(design: Identifiability) -> str:
-    alike = sorted(design.alike, key=lambda pair: -design.cosine_similarity[pair])
-    if alike:
-        listed = joined([f"{short_name(a)} with {short_name(b)}" for a, b in alike[:4]])
-        rest = len(alike) - 4
-        more = f", and {rest} more pair{'s' * (rest > 1)}" if rest > 0 else ""
-        text = f"On these conditions some effects look the same (framed): {listed}{more}."
-    else:
-        text = f"No two effects look alike here (no cosine of {ALIKE:g} or more)."
-    hard = [n for n, share in design.absorbed.items() if share > 0.8]
-    if hard:
-        text += (
-            f" The simulator's own parameters could take up more than 80 % of "
-            f"{joined([short_name(n) for n in hard])}."
-        )
-    sizes = [size for size in design.detectable.values() if np.isfinite(size)]
-    shows = f"{short(min(sizes))} to {short(max(sizes))} noise sd" if sizes else "no size"
-    return (
-        f"{text} What is told from noise in 80 % of campaigns like this one, by whatever name, are "
-        f"effects of at least {shows} (rms over the rows of the output where it is largest; "
-        "the noise is the laboratory's alone here). Only conditions and laboratory data were used "
-        "for this figure; likeness is in hundredths."
+# How far
+
+
+def how_far_plate(d: GapDocument, say: Words) -> Plate:
+    """Draw data against predictions, errors over slip, and errors at unfitted conditions."""
+    outputs = output_rows(d)
+    fig, axes = panels(
+        len(outputs), 3, height=46.0, left=15.0, right=4.0, top=6.0, bottom=17.0, gap_x=16.0,
+        gap_y=14.0,
+    )  # fmt: skip
+    column = _abscissa(d)
+    axis = axis_of(column)
+    x = axis.scale(np.array(d.conditions[column]))
+    for row, own in zip(axes, outputs, strict=True):
+        word = say.n.output(own.name)
+        handles = _against(row[0], own, word)
+        _errors(row[1], x[own.rows], own)
+        row[1].set_xlabel(axis.label)
+        _bars(row[2], d, own)
+    axes[0, 0].set_title("Data against prediction", loc="left")
+    axes[0, 1].set_title("Error at the field rows", loc="left")
+    where = "new conditions" if d.judged_on == "new conditions" else "field conditions"
+    axes[0, 2].set_title(f"Expected at {where}", loc="left")
+    legend_below(fig, handles, 4)
+    return Plate(fig, "how_far", say("caption_how_far"), "How far: before and after")
+
+
+def _against(ax: Axes, own: OutputRows, word: str) -> dict[str, Any]:
+    values = np.concatenate([own.measured, own.before, own.after])
+    margin = 0.05 * np.ptp(values)
+    ends = np.array([values.min() - margin, values.max() + margin])
+    ax.plot(ends, ends, color=GREY, lw=0.8)
+    handles: dict[str, Any] = {}
+    (handles["calibrated simulator (before)"],) = ax.plot(
+        own.before, own.measured, "s", mfc="none", mec=VERMILION, mew=0.9, ms=4.0
     )
+    (handles["corrected (after)"],) = ax.plot(
+        own.after, own.measured, "o", color=BLUE, mec="white", mew=0.4, ms=4.4
+    )
+    ax.set_xlim(*ends)
+    ax.set_ylim(*ends)
+    ax.set_xlabel(f"Predicted {word} ({own.axis.unit})")
+    ax.set_ylabel(f"Measured {word} ({own.axis.unit})")
+    return handles
 
 
-type _Draw = Callable[[Diagnosis], Plate | None]
+def _errors(ax: Axes, x: Array, own: OutputRows) -> None:
+    before, after = own.measured - own.before, own.measured - own.after
+    _noise_band(ax, x, own.noise, _Z)
+    ax.vlines(x, after, before, color="#bdbdbd", lw=0.8, zorder=1)
+    ax.plot(x, before, "s", mfc="none", mec=VERMILION, mew=0.9, ms=3.6, zorder=2)
+    ax.plot(x, after, "o", color=BLUE, mec="white", mew=0.4, ms=4.2, zorder=3)
+    ax.set_ylabel(f"Measured minus predicted ({own.axis.unit})")
 
+
+def _bars(ax: Axes, d: GapDocument, own: OutputRows) -> None:
+    """Draw rms errors with the noise floor, or say that there is no gap to shrink."""
+    s, factor = d.shrink.get(own.name), own.axis.factor
+    if s is None:
+        ax.axis("off")
+        ax.text(
+            0.5, 0.5, "no gap that\ncould shrink", ha="center", va="center", color=GREY,
+            transform=ax.transAxes,
+        )  # fmt: skip
+        return
+    before, after, floor = (factor * v for v in (s.rmse_before, s.rmse_after, s.noise_floor))
+    ax.set_ylabel(f"Error of the prediction, rms ({own.axis.unit})")
+    ax.bar([0.0], [before], width=0.62, color="white", edgecolor=VERMILION, lw=1.2)
+    ax.bar([1.0], [after], width=0.62, color=BLUE)
+    high, low = (before * (1.0 - f) for f in s.interval)
+    bar = [[max(after - low, 0.0)], [max(high - after, 0.0)]]
+    ax.errorbar([1.0], [after], bar, fmt="none", ecolor=BLACK, elinewidth=0.9, capsize=2.5)
+    ax.axhline(floor, color=BLACK, lw=0.9, ls=(0, (1, 1)))
+    top = 1.3 * max(before, floor, high)
+    ax.set_ylim(0.0, top)
+    if top > 0.01:
+        ax.ticklabel_format(axis="y", style="plain")
+    ax.text(1.47, floor + 0.012 * top, "noise", ha="right", va="bottom", fontsize=SMALLEST_PT)
+    text = f"shrinks by {100.0 * s.fraction:.0f} %\n({percent_range(s.interval)})"
+    ax.text(0.5, 0.985, text, ha="center", va="top", fontsize=7.0, transform=ax.transAxes)
+    ax.set_xlim(-0.5, 1.5)
+    ax.set_xticks([0.0, 1.0], ["before", "after"])
+    ax.tick_params(axis="x", length=0.0)
+
+
+type _Draw = Callable[[GapDocument, Words], Plate | None]
+
+# In reading order.
 _DRAWINGS: dict[str, _Draw] = {
     "isolability": isolability_plate,
     "where": where_plate,
@@ -367,14 +585,12 @@ _DRAWINGS: dict[str, _Draw] = {
 }
 
 
-GAP_FIGURES = tuple(_DRAWINGS)
-
-
-def gap_plates(found: Diagnosis, names: Sequence[str] = GAP_FIGURES) -> list[Plate]:
-    """Draw the figures of a diagnosis.
+def gap_plates(d: GapDocument, names: Sequence[str] = ()) -> list[Plate]:
+    """Draw the figures of a diagnosis, in the units of its files.
 
     Parameters
     ----------
+    d : GapDocument
     names : sequence of str, optional
         Of those to draw; all by default.
 
@@ -383,10 +599,9 @@ def gap_plates(found: Diagnosis, names: Sequence[str] = GAP_FIGURES) -> list[Pla
     list of Plate
         In reading order. A figure that failed has ``figure=None`` and a caption saying why.
     """
-    plates = draw_all({name: partial(_DRAWINGS[name], found) for name in names})
-    return marked(plates, found.data.case.label)
-
-
-# Letters of a name in one line, and their mean width.
-_LINE = 27
-_MM_PER_LETTER = 1.45
+    with units_of(d.headers):
+        say = Words(d)
+        plates = draw_all({
+            name: partial(_DRAWINGS[name], d, say) for name in names or _DRAWINGS
+        })  # fmt: skip
+    return marked(plates, d.label)

@@ -92,9 +92,9 @@ def section(o: Output, result: OutputResult, drawn: Drawn | None) -> dict[str, A
         "chains": o.found["sampling"],
         "mark": MARKS[verdict.level],
         "tone": _CLASSES[verdict.level],
-        "equation": equation(bound),
+        "equation": equation(bound.model.latex, bound.model.numbers),
         "likelihood": to_html(likelihood(o)),
-        "parametrisation": said(parametrisation(bound)),
+        "parametrisation": said(parametrisation(bound.model.parametrisation, bound.references)),
         "tables": tables_of(o),
         "figures": {
             p.name: {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from pathlib import PurePosixPath
 from typing import Any
@@ -13,10 +13,18 @@ from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, Te
 from markupsafe import Markup
 
 from calib.data.reader import said_of
-from calib.models import BoundModel
 from calib.models.card import mathml
 from calib.report.figures.plate import Plate
-from calib.report.labels import MINUS, joined, percent, plain, short, unbroken
+from calib.report.labels import (
+    MINUS,
+    joined,
+    odds_text,
+    percent,
+    plain,
+    short,
+    unbroken,
+    unit_after,
+)
 from calib.report.numbers import (
     format_number,
     format_value,
@@ -38,13 +46,16 @@ _FILTERS: dict[str, Callable[..., str]] = {
     "basename": lambda path: PurePosixPath(path).name,
     "joined": joined,
     "said_of": said_of,
+    "odds": odds_text,
     "percent": percent,
     "short": short,
     "value": format_value,
     "number": format_number,
     "known": _known,
+    "unit_after": unit_after,
     "g": lambda value: f"{value:g}",
     "lower_first": lambda text: text[0].lower() + text[1:],
+    "upper_first": lambda text: text[:1].upper() + text[1:],
 }
 
 
@@ -54,17 +65,18 @@ def png_size(image: bytes) -> tuple[int, int]:
 
 
 @cache
-def template(name: str, package: str = _HERE, *, html: bool = True) -> Template:
+def template(name: str, package: str = _HERE, *, html: bool = True, trim: bool = True) -> Template:
     """Return a template by the name of its file in a package, which may include those of this one.
 
-    For HTML it escapes what it is given; a name that it is not given is an error.
+    For HTML it escapes what it is given; a name that it is not given is an error. Lines of a block
+    alone leave no white space if `trim`.
     """
     environment = Environment(
         loader=ChoiceLoader([PackageLoader(p, ".") for p in dict.fromkeys((package, _HERE))]),
         autoescape=html,
         undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
+        trim_blocks=trim,
+        lstrip_blocks=trim,
     )
     environment.filters |= _FILTERS
     return environment.get_template(name)
@@ -105,22 +117,21 @@ def picture(plate: Plate, image: bytes, caption: str) -> dict[str, Any]:
     }
 
 
-def equation(bound: BoundModel) -> Markup:
-    """Return the equation of a model."""
-    model = bound.model
-    written = Markup(", ").join(Markup(mathml(part)) for part in model.latex)
-    number = model.numbers.replace("-", "\N{EN DASH}")
+def equation(latex: Iterable[str], numbers: str) -> Markup:
+    """Return the equation of a model, with its numbers in the source."""
+    written = Markup(", ").join(Markup(mathml(part)) for part in latex)
+    number = numbers.replace("-", "\N{EN DASH}")
     mark = Markup(" <span class='eq'>({})</span>").format(number) if number else ""
     return Markup("{}{}").format(written, mark)
 
 
-def parametrisation(bound: BoundModel) -> str:
-    """Say which parameters are sampled, and why these."""
-    references = dict(bound.references)
-    for name, half in bound.references.items():
+def parametrisation(text: str, about: Mapping[str, float]) -> str:
+    """Say which parameters of a model are sampled, about which references, and why these."""
+    references = dict(about)
+    for name, half in about.items():
         stem, middle, unit = name.partition("_half_")
         if middle:
             middle_at = references[f"{stem}_mid_{unit}"]
             references[f"{stem}_low_{unit}"] = middle_at - half
             references[f"{stem}_high_{unit}"] = middle_at + half
-    return bound.model.parametrisation.format(**references).replace(" - ", f" {MINUS} ")
+    return text.format(**references).replace(" - ", f" {MINUS} ")
