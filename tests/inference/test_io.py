@@ -62,6 +62,7 @@ def test_everything_else_survives_too(rut_calibration: Calibration, loaded: Cali
     np.testing.assert_array_equal(loaded.draws.log_prob, rut_calibration.draws.log_prob)
     np.testing.assert_array_equal(loaded.draws.mode, rut_calibration.draws.mode)
     assert loaded.converged
+    assert loaded.problem.table.label == "reconstructed"
     assert (loaded.seed, loaded.label) == (rut_calibration.seed, rut_calibration.label)
     for name in ("log_evidence", "efficiency", "acceptance", "evaluations", "seconds"):
         assert getattr(loaded.draws, name) == getattr(rut_calibration.draws, name)
@@ -90,10 +91,6 @@ def test_a_model_that_has_changed_is_told(
         return
     with pytest.raises(CalibError, match="modified_bekker no longer gives its draws"):
         load_calibration(saved)
-
-
-def test_reconstructed_data_stay_labelled_so(loaded: Calibration) -> None:
-    assert loaded.problem.table.label == "reconstructed"
 
 
 def test_the_tree_has_its_groups_and_dimensions(rut_calibration: Calibration) -> None:
@@ -191,19 +188,13 @@ def test_fixed_parameters_and_loads_survive(tmp_path: Path) -> None:
     assert [p.loc for p in loaded.problem.priors.entries] == [p.loc for p in problem.priors.entries]
 
 
-def without(key: str) -> Callable[[Path], None]:
+def replaced(key: str, *values: object) -> Callable[[Path], None]:
+    """Give an entry another value, or take it out."""
+
     def damage(folder: Path) -> None:
         meta = json.loads((folder / "run.json").read_text())
         del meta[key]
-        (folder / "run.json").write_text(json.dumps(meta))
-
-    return damage
-
-
-def replaced(key: str, value: object) -> Callable[[Path], None]:
-    def damage(folder: Path) -> None:
-        meta = json.loads((folder / "run.json").read_text())
-        meta[key] = value
+        meta |= dict.fromkeys([key], *values) if values else {}
         (folder / "run.json").write_text(json.dumps(meta))
 
     return damage
@@ -222,17 +213,12 @@ def truncated(name: str) -> Callable[[Path], None]:
     [
         (lambda folder: (folder / "run.json").unlink(), ""),
         (lambda folder: (folder / "posterior.nc").unlink(), "posterior.nc"),
-        (lambda folder: (folder / "data.csv").unlink(), "data.csv"),
         (truncated("run.json"), ""),
         (truncated("posterior.nc"), "posterior.nc"),
-        (lambda folder: (folder / "posterior.nc").write_bytes(b""), "posterior.nc"),
         (lambda folder: (folder / "run.json").write_text("[]"), ""),
-        (lambda folder: (folder / "run.json").write_bytes(b"\xff\xfe"), ""),
-        (without("schema"), ""),
-        (without("model"), "run.json"),
-        (without("gate"), "run.json"),
-        (without("shape"), "run.json"),
-        (without("seed"), "run.json"),
+        (replaced("schema"), ""),
+        (replaced("gate"), "run.json"),
+        (replaced("shape"), "run.json"),
         (replaced("shape", [4, 20, 999, 4]), "posterior.nc"),
         (replaced("references", None), None),
         (replaced("model", "pacejka"), None),

@@ -46,13 +46,6 @@ def test_the_likelihood_of_rut_depth_is_log_normal_jacobian_included(rut_problem
     np.testing.assert_allclose(rut_problem.log_likelihood(t), expected.sum(axis=1), rtol=1e-9)
 
 
-def test_the_posterior_is_prior_times_likelihood(rut_problem: Problem) -> None:
-    t = near(rut_problem)
-    expected = rut_problem.priors.log_prob(t) + rut_problem.log_likelihood(t)
-    np.testing.assert_allclose(rut_problem.log_prob(t), expected, rtol=1e-12)
-    assert rut_problem.log_prob(t[0]).shape == (1,)
-
-
 def test_outside_the_bounds_the_density_is_zero(pull_problem: Problem) -> None:
     t = near(pull_problem, 3)
     t[1, pull_problem.names.index("C")] = 2.001
@@ -89,14 +82,6 @@ def test_holding_parameters_fixed(rut_problem: Problem) -> None:
     full = np.insert(t, 2, 1.0, axis=1)
     np.testing.assert_allclose(held.log_likelihood(t), rut_problem.log_likelihood(full))
     assert rut_problem.names == ("z_ref", "n0", "n1", "sigma")
-
-
-def test_fixed_at_the_building() -> None:
-    table = table_from_arrays(
-        {"slip_ratio": np.linspace(0, 0.5, 8), "drawbar_pull_kn": np.linspace(0, 1, 8) ** 0.5}
-    )
-    problem = build_problem("magic_formula", table, fixed={"Sh": 0.0, "Sv": 0.0})
-    assert problem.names == ("K", "C", "D", "G", "sigma")
 
 
 def test_other_rows_keep_the_reference_conditions(rut_tables: tuple[Table, Table]) -> None:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from scipy import stats
+import pytest
+from scipy.stats import kstest, qmc
 
-from calib.inference.random import generator, stream
+from calib.inference.random import even_points, generator, latin, stream
 
 PURPOSES = [(), ("a",), ("b",), ("a", "b"), ("b", "a"), ("ab",), ("a", "refit", 0),
             ("a", "refit", 1)]  # fmt: skip
@@ -28,16 +29,29 @@ def test_every_seed_and_purpose_has_its_own_stream() -> None:
     assert len(set(states)) == len(states)
 
 
-def test_streams_are_uncorrelated() -> None:
-    draws = np.stack([generator(1, *labels).standard_normal(2000) for labels in PURPOSES])
-    off = np.corrcoef(draws)[np.triu_indices(len(PURPOSES), 1)]
-    # 28 correlations of sd 1/sqrt(2000); a two-sided level of 1e-4 over all of them.
-    assert np.abs(off).max() < stats.norm.ppf(1 - 0.5e-4 / off.size) / np.sqrt(2000)
+@pytest.mark.parametrize(("size", "dim"), [(64, 1), (64, 4), (400, 7)])
+def test_they_fill_the_cube_more_evenly_than_random_points(size: int, dim: int) -> None:
+    points = even_points(size, dim)
+    assert points.shape == (size, dim)
+    assert ((points >= 0.0) & (points < 1.0)).all()
+    random = [
+        qmc.discrepancy(np.random.default_rng(seed).uniform(size=(size, dim))) for seed in range(20)
+    ]
+    assert qmc.discrepancy(points) < min(random)
 
 
-def test_children_do_not_disturb_the_stream() -> None:
-    parent = stream(5, "x")
-    before = parent.generate_state(4)
-    children = parent.spawn(2)
-    np.testing.assert_array_equal(parent.generate_state(4), before)
-    assert tuple(children[0].generate_state(4)) != tuple(children[1].generate_state(4))
+def test_nobody_can_change_what_others_are_given() -> None:
+    with pytest.raises(ValueError, match="read-only"):
+        even_points(8, 2)[0, 0] = 0.5
+
+
+def test_a_latin_hypercube_has_one_point_in_each_slice_of_every_coordinate() -> None:
+    points = latin(np.random.default_rng(1), 40, 3)
+    assert points.shape == (40, 3)
+    for column in points.T:
+        assert sorted(np.floor(40 * column).astype(int).tolist()) == list(range(40))
+    # Slices are paired at random, and a point may lie anywhere in its own.
+    assert np.abs(np.corrcoef(latin(np.random.default_rng(2), 4000, 2).T)[0, 1]) < 0.08
+    drawn = [latin(np.random.default_rng(seed), 40, 3) for seed in range(9)]
+    within = np.ravel(drawn) * 40 % 1
+    assert kstest(within, "uniform").pvalue > 1e-4

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from calib.inference.emulation.prepared import prepare, write_failed
 from calib.inference.emulation.state import EmulationSettings, State
 from calib.models import MODELS
 from calib.models.simulators.declaration import SIMULATED, Simulated
-from calib.models.simulators.simulator import Failure, Run, RunKeeper
+from calib.models.simulators.simulator import Run, RunKeeper
 from tests.models.simulators.examples import PRIORS, lab, pull
 from tests.registered import forgotten
 
@@ -213,8 +212,7 @@ def test_first_runs_that_fail_in_several_ways_are_no_reason_to_stop() -> None:
 
 
 @pytest.mark.parametrize("deterministic", [True, False])
-@pytest.mark.parametrize("runs", [10, pytest.param(25, marks=pytest.mark.slow)])
-def test_the_budget_is_of_all_runs_that_are_made(runs: int, deterministic: bool) -> None:
+def test_the_budget_is_of_all_runs_that_are_made(deterministic: bool) -> None:
     """Probes, repeats and checks among them; what cannot be reached with so few is told."""
     made = []
 
@@ -222,10 +220,10 @@ def test_the_budget_is_of_all_runs_that_are_made(runs: int, deterministic: bool)
         made.append(theta)
         return pull(theta, x) * np.cos(25.0 * theta[:, :1])
 
-    declared(counted, "counted", emulate=True, runs=runs, deterministic=deterministic)
+    declared(counted, "counted", emulate=True, runs=10, deterministic=deterministic)
     emulation = calib.emulated(calib.build_problem("counted", table()), seed=1)
-    assert len(made) == len(emulation.runs) == runs
-    assert emulation.document()["runs"] == runs
+    assert len(made) == len(emulation.runs) == 10
+    assert emulation.document()["runs"] == 10
 
 
 def below_zero(emulation: calib.Emulation) -> bool:
@@ -259,10 +257,8 @@ def test_what_grows_beyond_bounds_across_zero_does_not_matter_to_a_fit() -> None
     agree(calib.calibrate(emulation.problem, seed=1), exact(data, parameters=vague))
 
 
-@pytest.mark.parametrize("edge", [0.08, pytest.param(0.04, marks=pytest.mark.slow)])
-def test_runs_that_fail_across_zero_alone_are_made_without(edge: float) -> None:
-    """From the first runs, or from later ones of the first design."""
-    made = []
+def test_runs_that_fail_across_zero_alone_are_made_without() -> None:
+    made, edge = [], 0.08
 
     def stops(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
         made.append(theta)
@@ -281,23 +277,6 @@ def test_runs_that_fail_across_zero_alone_are_made_without(edge: float) -> None:
     assert emulation.emulator.training.ok.all()
 
 
-@pytest.mark.slow
-def test_what_fails_by_chance_or_anywhere_is_no_reason_to_do_without_what_lies_across_zero() -> (
-    None
-):
-    rng = np.random.default_rng(1)
-
-    def now_and_then(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
-        if theta[0, 0] > 0.75 or rng.random() < 0.3:
-            raise RuntimeError("the licence is lost")
-        return pull(theta, x)
-
-    declared(now_and_then, "chance", emulate=True, runs=40, checks=4)
-    emulation = calib.emulated(calib.build_problem("chance", table()), seed=1)
-    assert emulation.failed
-    assert below_zero(emulation)
-
-
 def test_far_from_all_runs_there_is_no_value() -> None:
     """Else a posterior that a crash leaves no room flees there."""
     declared(pull, "slow", emulate=True, runs=20, checks=0)
@@ -306,23 +285,6 @@ def test_far_from_all_runs_there_is_no_value() -> None:
     far = np.stack([z.max(axis=0) + 0.9, z.max(axis=0) + 1.1, z.min(axis=0) - 1.1])
     assert emulator.holds(far).tolist() == [True, False, False]
     assert np.isnan(emulator.coefficients(emulator.axes.natural(far))[1:]).all()
-
-
-def test_a_limit_of_time_is_for_each_run() -> None:
-    def now_and_then(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
-        import time
-
-        if theta[0, 0] > 0.9:
-            time.sleep(60)
-        return pull(theta, x)
-
-    found = declared(now_and_then, "hanging", emulate=True, limit=2.0).simulator
-    assert found.limit == 2.0
-    x = {name: np.array([0.1, 0.2]) * (1 if name == "slip_ratio" else 30) for name in CONDITIONS}
-    assert not isinstance(found.run(np.array([0.5, 0.1]), x), Failure)
-    late = replace(found, retries=0).run(np.array([1.0, 0.1]), x)
-    assert isinstance(late, Failure)
-    assert late.kind == "time"
 
 
 @pytest.mark.slow
@@ -345,12 +307,6 @@ def test_its_own_noise_is_found_and_smoothed_over() -> None:
     agree(calib.calibrate(emulation.problem, seed=1), directly(), mean=0.3, sd=0.2)
 
 
-def test_a_simulator_that_only_seems_deterministic_is_found_out() -> None:
-    rng = np.random.default_rng(3)
-    declared(lambda t, x: pull(t, x) + 0.02 * rng.standard_normal(), "coy", emulate=True, runs=40)
-    assert calib.emulated(calib.build_problem("coy", table()), seed=1).own_noise > 0.0
-
-
 def test_one_that_scatters_too_much_is_to_be_declared_so_before_more_runs_are_made() -> None:
     rng = np.random.default_rng(3)
     declared(
@@ -358,6 +314,7 @@ def test_one_that_scatters_too_much_is_to_be_declared_so_before_more_runs_are_ma
         nodes=18,
     )  # fmt: skip
     emulation = calib.emulated(calib.build_problem("coy", table()), seed=1)
+    assert emulation.own_noise > 0.0
     assert "write deterministic = false in the simulator file" in emulation.reasons[0]
     assert "more runs" not in emulation.reasons[0]
     assert emulation.reasons[0].count("kN (rms)") == 1
@@ -370,16 +327,13 @@ def test_a_simulator_that_no_parameter_changes_is_refused() -> None:
     assert "simulator still" in str(told.value)
 
 
-@pytest.mark.parametrize("idle", [True, False])
-def test_a_parameter_that_changes_nothing_is_named(
-    idle: bool, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_parameter_that_changes_nothing_is_named(caplog: pytest.LogCaptureFixture) -> None:
     def off(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
-        return pull(np.stack([theta[:, 0], 0.0 * theta[:, 1] + 0.08], axis=1) if idle else theta, x)
+        return pull(np.stack([theta[:, 0], 0.0 * theta[:, 1] + 0.08], axis=1), x)
 
     declared(off, "idle", emulate=True)
     calib.emulated(calib.build_problem("idle", table()), seed=1)
-    assert ("s0 changes no output" in caplog.text) is idle
+    assert "s0 changes no output" in caplog.text
     assert "mu changes" not in caplog.text
 
 

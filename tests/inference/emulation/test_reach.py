@@ -51,12 +51,9 @@ def test_the_rows_of_every_run_and_the_checks_are_as_many_as_asked_for(nodes: in
     [
         ({"runs": 80, "checks": 17}, "checks = 17 is more than runs = 80"),
         ({"runs": 40, "first": 39}, "first = 39 is more than runs = 40"),
-        ({"runs": 5}, "greater than or equal to 10"),
         ({"check": 5}, "emulator.check"),
-        ({"tolerance": 0.0}, "greater than 0"),
         ({"tolerance": float("nan")}, "emulator.tolerance"),
         ({"nodes": 1}, "greater than or equal to 2"),
-        ({"nodes": 10.5}, "emulator.nodes"),
     ],
 )
 def test_a_setting_that_cannot_be_honoured_is_refused(given: dict, words: str) -> None:

@@ -31,7 +31,7 @@ from tests.inference.sampling.closed_form import (
 )
 from tests.inference.sampling.test_modes import box
 
-QUICK = SamplerSettings(steps=100, max_steps=100, keep=50)
+QUICK = SamplerSettings(walkers=32, steps=50, max_steps=50, keep=50)
 
 
 def slow(*case: float):
@@ -62,18 +62,6 @@ def test_an_unknown_noise_scale() -> None:
         assert_distributed(draws, lambda t, i=i: t[:, i], model.marginal_unknown(i))
     assert_distributed(draws, lambda t: np.exp(2.0 * t[:, 3]), model.sigma2())
     assert abs(draws.log_evidence - model.log_evidence_unknown()) < 5.0 * evidence_error(draws)
-
-
-@pytest.mark.slow  # `test_an_attempt_that_fails_teaches_the_next` ends on a harder one, as slowly
-def test_a_banana() -> None:
-    def log_prob(t):
-        bent = t[:, 1] - t[:, 0] ** 2
-        return stats.norm.logpdf(t[:, 0]) + stats.norm.logpdf(bent, 0.0, 0.4)
-
-    draws = run(log_prob, np.zeros(2), np.eye(2))
-    assert draws.report.passed
-    assert_distributed(draws, lambda t: t[:, 0], stats.norm())
-    assert_distributed(draws, lambda t: t[:, 1] - t[:, 0] ** 2, stats.norm(0.0, 0.4))
 
 
 def test_heavy_tails() -> None:
@@ -195,12 +183,12 @@ def test_an_attempt_that_fails_teaches_the_next() -> None:
 
 @pytest.mark.parametrize(("d", "thinness"), [(2, 0.05), slow(4, 0.1), slow(7, 0.3)])
 def test_thin_bent_ridges_come_out_right_or_are_refused(d: int, thinness: float) -> None:
-    draws = on_ridge(d, thinness, 800)
+    draws = on_ridge(d, thinness, 400)
     if draws.report.passed:
         assert_distributed(draws, lambda t: t[:, 0], stats.norm())
 
 
-@pytest.mark.parametrize("seed", [slow(seed) for seed in range(5)])
+@pytest.mark.parametrize("seed", [slow(0)])
 def test_distant_modes_come_out_in_their_proportions(seed: int) -> None:
     """A square tells no sign: modes 80 sd apart, which no local move ever crosses."""
     slip = np.linspace(0.0, 0.2, 12)
@@ -218,31 +206,6 @@ def test_distant_modes_come_out_in_their_proportions(seed: int) -> None:
     assert abs(right.mean() - exact) < SIGMAS * np.sqrt(exact * (1.0 - exact) / size)
     ln_evidence = np.log(density.sum() * 5e-5) + problem.log_prob(grid).max()
     assert abs(draws.log_evidence - ln_evidence) < SIGMAS * evidence_error(draws)
-
-
-def test_the_numbers_follow_from_the_seed(rut_tables: tuple[Table, Table]) -> None:
-    problem = build_problem("modified_bekker", rut_tables[0])
-    first, again, other = (
-        sample_posterior(problem, seed, settings=QUICK) for seed in (3, 3, 4)
-    )  # fmt: skip
-    np.testing.assert_array_equal(first.t, again.t)
-    np.testing.assert_array_equal(first.log_prob, again.log_prob)
-    assert (first.log_evidence, first.efficiency) == (again.log_evidence, again.efficiency)
-    assert not (first.t == other.t).any()
-
-
-def test_ensembles_are_seeded_independently(rut_calibration) -> None:
-    t = rut_calibration.draws.t
-    for i in range(t.shape[0]):
-        for j in range(i):
-            assert not (t[i] == t[j]).any()
-
-
-def test_log_densities_belong_to_the_draws(rut_calibration) -> None:
-    draws: Draws = rut_calibration.draws
-    picked = draws.t[:, ::10, ::20]
-    expected = rut_calibration.problem.log_prob(picked.reshape(-1, picked.shape[-1]))
-    np.testing.assert_allclose(draws.log_prob[:, ::10, ::20].ravel(), expected, rtol=1e-10)
 
 
 def test_a_run_extends_itself_until_the_gate_passes() -> None:
@@ -267,13 +230,11 @@ def test_extension_stops_where_it_is_told_to(steps: int, most: int, done: int) -
 def test_progress_counts_up_to_what_is_planned(rut_tables: tuple[Table, Table]) -> None:
     seen: list[tuple[int, int]] = []
     problem = build_problem("modified_bekker", rut_tables[0])
-    told = sample_posterior(
+    sample_posterior(
         problem, 3, settings=QUICK, progress=lambda done, planned: seen.append((done, planned))
     )
     assert [done for done, _ in seen] == sorted(done for done, _ in seen)
     assert seen[-1][0] == seen[-1][1]
-    untold = sample_posterior(problem, 3, settings=QUICK)
-    np.testing.assert_array_equal(told.t, untold.t)
 
 
 def test_no_parameters_of_positive_probability(rut_tables: tuple[Table, Table]) -> None:
@@ -306,8 +267,12 @@ def test_a_density_that_is_almost_nowhere_positive_cannot_be_started() -> None:
         run(log_prob, np.zeros(2), np.eye(2), settings=QUICK)
 
 
-def test_flat_draws_keep_their_vectors(rut_calibration) -> None:
+def test_draws_of_a_calibration_belong_together(rut_calibration) -> None:
     draws: Draws = rut_calibration.draws
+    picked = draws.t[:, ::10, ::20]
+    expected = rut_calibration.problem.log_prob(picked.reshape(-1, picked.shape[-1]))
+    np.testing.assert_allclose(draws.log_prob[:, ::10, ::20].ravel(), expected, rtol=1e-10)
+    assert not any((draws.t[i] == draws.t[j]).any() for i in range(4) for j in range(i))
     np.testing.assert_array_equal(draws.flat[0], draws.t[0, 0, 0])
     np.testing.assert_array_equal(draws.flat[-1], draws.t[-1, -1, -1])
     assert 0.0 < draws.acceptance < 1.0
