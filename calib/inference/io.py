@@ -300,6 +300,7 @@ def _prior_group(calibration: Calibration) -> dict[str, Array]:
 
 def _describe(calibration: Calibration) -> dict[str, Any]:
     problem, report = calibration.problem, calibration.draws.report
+    known = prior_references(problem.table.columns)
     return {
         "schema": "calib/run/1",
         "model": problem.bound.model.name,
@@ -308,7 +309,9 @@ def _describe(calibration: Calibration) -> dict[str, Any]:
         "fixed": {p.name: p.loc for p in problem.priors.entries if p.fixed},
         "prior_file": PurePath(problem.priors.source).name,
         "prior_text": problem.priors.text,
-        "prior_references": _references(problem),
+        "prior_references": {
+            name: known[name] for name in relative_columns(problem.priors.text) if name in known
+        },
         "seed": calibration.seed,
         "label": calibration.label,
         "shape": list(calibration.draws.t.shape),
@@ -336,11 +339,6 @@ def describe_estimates(estimates: Sequence[PointEstimate]) -> list[dict[str, Any
         | {k: getattr(e, k) for k in ("reported", "cost", "rmse")}
         for e in estimates
     ]
-
-
-def _references(problem: Problem) -> dict[str, float]:
-    known = prior_references(problem.table.columns)
-    return {name: known[name] for name in relative_columns(problem.priors.text) if name in known}
 
 
 def save_calibration(
@@ -375,20 +373,6 @@ def save_calibration(
     (folder / RUN).write_text(json.dumps(described, indent=1) + "\n", encoding="utf-8")
 
 
-def _check_hashes(record: RunRecord, folder: Path) -> None:
-    """A run is predicted from only as it was written."""
-    for name, expected in record.sha256.items():
-        with _damage(folder / name):
-            content = (folder / name).read_bytes()
-        if (found := sha256(content)) != expected and not differs_in_lines(content, expected):
-            raise CalibError(
-                "the file has changed since the run was written",
-                where=str(folder / name),
-                expected=f"SHA-256 {expected[:16]}..., found {found[:16]}...",
-                hint="restore it, or run `calib fit` again",
-            )
-
-
 def load_calibration(folder: Path) -> Calibration:
     """Read a run folder.
 
@@ -400,7 +384,17 @@ def load_calibration(folder: Path) -> Calibration:
     folder = Path(folder)
     record = read_record(RunRecord, folder)
     meta: dict[str, Any] = record.document
-    _check_hashes(record, folder)
+    # A run is predicted from only as it was written.
+    for name, expected in record.sha256.items():
+        with _damage(folder / name):
+            content = (folder / name).read_bytes()
+        if (found := sha256(content)) != expected and not differs_in_lines(content, expected):
+            raise CalibError(
+                "the file has changed since the run was written",
+                where=str(folder / name),
+                expected=f"SHA-256 {expected[:16]}..., found {found[:16]}...",
+                hint="restore it, or run `calib fit` again",
+            )
     with _damage(folder / RUN):
         problem = run_problem(record, folder / DATA)
         shape = tuple(meta["shape"])
@@ -410,9 +404,19 @@ def load_calibration(folder: Path) -> Calibration:
         t = priors.to_internal(natural.reshape(-1, natural.shape[-1]), margin=0.0).reshape(shape)
     with _damage(folder / RUN):
         _check_model(problem, t, log_prob, folder)
-        found = Calibration(problem, _draws(meta, t, log_prob), record.seed, record.label)
-        _ = found.parameters  # what cannot be reported is damaged as well
-        return found
+        gate = meta["gate"]
+        report = GateReport(
+            names=tuple(gate["names"]), steps=gate["steps"], passed=gate["passed"],
+            reasons=tuple(gate["reasons"]), **{k: np.array(gate[k]) for k in _OF_GATE},
+        )  # fmt: skip
+        draws = Draws(
+            t=t, log_prob=log_prob, report=report, mode=np.array(meta["mode"]),
+            walkers=meta.get("walkers", t.shape[1]),  # earlier run folders had all stored
+            **{k: meta[k] for k in (*_OF_DRAWS, "seconds")},
+        )  # fmt: skip
+        calibration = Calibration(problem, draws, record.seed, record.label)
+        _ = calibration.parameters  # what cannot be reported is damaged as well
+        return calibration
 
 
 def _check_model(problem: Problem, t: Array, log_prob: Array, folder: Path) -> None:
@@ -463,23 +467,6 @@ def run_problem(record: RunRecord, data: Path) -> Problem:
     # A run holds the rows that it was calibrated on: those that the noise is measured by.
     noise = noise_of(priors.noise, model.select(table.columns), record.prior_file)
     return Problem(BoundModel(model, record.references), table, priors, noise=noise)
-
-
-def _draws(meta: dict[str, Any], t: Array, log_prob: Array) -> Draws:
-    gate = meta["gate"]
-    report = GateReport(
-        names=tuple(gate["names"]), steps=gate["steps"], passed=gate["passed"],
-        reasons=tuple(gate["reasons"]), **{k: np.array(gate[k]) for k in _OF_GATE},
-    )  # fmt: skip
-    return Draws(
-        t=t,
-        log_prob=log_prob,
-        report=report,
-        mode=np.array(meta["mode"]),
-        # Earlier run folders had all walkers stored.
-        walkers=meta["walkers"] if "walkers" in meta else t.shape[1],
-        **{k: meta[k] for k in (*_OF_DRAWS, "seconds")},
-    )
 
 
 def estimate_again(record: RunRecord, problem: Problem) -> tuple[PointEstimate, ...]:

@@ -6,8 +6,7 @@ rows with mean m_y,
     sum (y - mu)^2 = sum (y - m_y)^2 + m (m_y - mu)^2,
 
 so the model is evaluated once per distinct condition. What is left is worked through in tiles, some
-rows times some vectors, that stay in the processor's cache and bound the memory. Each tile's part
-is summed on its own, so the number of threads does not change a digit of the result.
+rows times some vectors, that stay in the processor's cache and bound the memory.
 
 The density where the prediction is known with an error, a few curves B, (n, j), times independent
 normals of one variance v. Residuals r are normal with the covariance sigma^2 I + v B B'. With
@@ -32,11 +31,8 @@ sigma.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -46,131 +42,59 @@ from scipy.special import gammaln, ndtr, ndtri, stdtr, stdtrit
 from calib.data import Table
 from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
-from calib.inference.constants import HALF_LN_2PI, PARALLEL_CELLS, SHORT_TILE, TILE_CELLS
+from calib.inference.constants import HALF_LN_2PI, TILE_CELLS
 from calib.models.base import Array, BoundModel, Conditions
 
 
 @dataclass(frozen=True)
-class _Tile:
-    """Rows that are evaluated together."""
-
-    conditions: Conditions
-    response: Array
-    """Mean response at each distinct condition."""
-    repeats: Array | None
-    """How many rows share the condition; None where all are distinct."""
-
-
-@dataclass(frozen=True)
-class Squares:
+class SumOfSquares:
     """Sum of squared residuals of a bound model on fixed data.
 
-    `within` is that of the repeats about their means. Threads are for large tasks; the result does
-    not depend on them.
+    Parameters
+    ----------
+    tiles : tuple of (mapping of str to ndarray, ndarray, ndarray)
+        Distinct conditions in pieces, with the mean response and the number of rows at each.
+    n_distinct : int
+        Distinct conditions.
+    within : float
+        Sum of squares of the repeats about their means.
     """
 
     bound: BoundModel
-    tiles: tuple[_Tile, ...]
+    tiles: tuple[tuple[Conditions, Array, Array], ...]
     n_distinct: int
     within: float
-    threads: int
 
     @classmethod
-    def of(
-        cls,
-        bound: BoundModel,
-        conditions: Conditions,
-        response: Array,
-        *,
-        threads: int | None = None,
-    ) -> Squares:
-        """Arrange conditions and responses (n,) for a bound model, a thread for each processor."""
-        distinct, mean, repeats, within = _distinct(conditions, response)
-        tiles = tuple(_tile(distinct, mean, repeats, rows) for rows in _blocks(distinct, mean.size))
-        return cls(bound, tiles, mean.size, within, threads or _processors())
+    def of(cls, bound: BoundModel, conditions: Conditions, response: Array) -> SumOfSquares:
+        """Arrange conditions and responses (n,) for a bound model."""
+        code = np.zeros(response.size, dtype=np.intp)
+        for values in conditions.values():
+            # Renumbered at every step, so that the codes cannot overflow.
+            levels, inverse = np.unique(values, return_inverse=True)
+            code = np.unique(code * levels.size + inverse, return_inverse=True)[1]
+        _, first, code, count = np.unique(
+            code, return_index=True, return_inverse=True, return_counts=True
+        )
+        mean = np.bincount(code, response) / count
+        tiles = []
+        for i in range(0, count.size, TILE_CELLS):
+            some = slice(i, i + TILE_CELLS)
+            distinct = {name: v[first[some]] for name, v in conditions.items()}
+            tiles.append((distinct, mean[some], count[some].astype(np.float64)))
+        within = float(np.square(response - mean[code]).sum())
+        return cls(bound, tuple(tiles), count.size, within)
 
     def __call__(self, theta: Array) -> Array:
         """Evaluate natural parameters of the model, (k, d) to (k,); NaN where it has no value."""
-        sums = np.empty((len(self.tiles), theta.shape[0]))
-
-        def work(i: int) -> None:
-            _evaluate(self.bound, self.tiles[i], theta, sums[i])
-
-        if self.threads > 1 and theta.shape[0] * self.n_distinct >= PARALLEL_CELLS:
-            with ThreadPoolExecutor(self.threads) as pool:
-                list(pool.map(work, range(len(self.tiles))))
-        else:
-            for i in range(len(self.tiles)):
-                work(i)
-        return np.asarray(sums.sum(axis=0) + self.within)
-
-
-def _processors() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-def _evaluate(bound: BoundModel, tile: _Tile, theta: Array, out: Array) -> None:
-    """Write each vector's sum of squares over a tile's rows."""
-    at_once = max(1, TILE_CELLS // tile.response.size)
-    # Threads have their own error state. Bad vectors come out as NaN.
-    with np.errstate(all="ignore"):
-        for i in range(0, theta.shape[0], at_once):
-            r = bound.mean_response(theta[i : i + at_once], tile.conditions) - tile.response
-            r *= r
-            out[i : i + at_once] = r.sum(axis=1) if tile.repeats is None else r @ tile.repeats
-
-
-def _tile(distinct: Conditions, mean: Array, repeats: Array | None, rows: slice) -> _Tile:
-    conditions = {name: v[rows] for name, v in distinct.items()}
-    return _Tile(conditions, mean[rows], None if repeats is None else repeats[rows])
-
-
-def _distinct(
-    conditions: Conditions, response: Array
-) -> tuple[dict[str, Array], Array, Array | None, float]:
-    """Merge the repeats; long data come back sorted by the condition of fewest values.
-
-    Return the distinct conditions and, of the rows at each, the mean response and the number (None
-    if none was repeated), all of shape (m,); and the sum of squares about the means.
-    """
-    n = response.size
-    levels = [np.unique(v, return_inverse=True) for v in conditions.values()]
-    levels.sort(key=lambda level: level[0].size)
-    code = np.zeros(n, dtype=np.intp)
-    for values, inverse in levels:
-        # Renumbered at every step, so that the codes cannot overflow.
-        code = np.unique(code * values.size + inverse, return_inverse=True)[1]
-    count = np.bincount(code)
-    if count.size == n:
-        order = np.argsort(code) if n > SHORT_TILE else np.arange(n)
-        return {name: v[order] for name, v in conditions.items()}, response[order], None, 0.0
-    first = np.empty(count.size, dtype=np.intp)
-    first[code[::-1]] = np.arange(n)[::-1]
-    mean = np.bincount(code, response) / count
-    within = float(np.square(response - mean[code]).sum())
-    distinct = {name: v[first] for name, v in conditions.items()}
-    return distinct, mean, count.astype(np.float64), within
-
-
-def _blocks(distinct: Conditions, n: int) -> list[slice]:
-    """Cut sorted rows into tiles, also where the condition of fewest values changes.
-
-    There the equation may work out per value what it would otherwise do per row.
-    """
-    if n <= SHORT_TILE:
-        return [slice(0, n)]
-    few = min(distinct.values(), key=lambda v: np.unique(v).size)
-    edges = np.flatnonzero(np.diff(few)) + 1
-    if edges.size * SHORT_TILE > n:
-        edges = edges[:0]
-    cuts = [0]
-    for edge in [*edges.tolist(), n]:
-        length = edge - cuts[-1]
-        parts = -(-length // TILE_CELLS)
-        cuts += [cuts[-1] + length * (j + 1) // parts for j in range(parts)]
-    return [slice(a, b) for a, b in pairwise(cuts)]
+        total = np.full(len(theta), self.within)
+        with np.errstate(all="ignore"):
+            for conditions, response, repeats in self.tiles:
+                at_once = max(1, TILE_CELLS // response.size)
+                for i in range(0, len(theta), at_once):
+                    mean = self.bound.mean_response(theta[i : i + at_once], conditions)
+                    total[i : i + at_once] += np.square(mean - response) @ repeats
+        return total
 
 
 def log_normal(residuals: Array, variance: Array, curves: Array, sigma: Array) -> Array:
@@ -189,7 +113,7 @@ def log_normal(residuals: Array, variance: Array, curves: Array, sigma: Array) -
     along = np.where(bad[:, None], 0.0, residuals) @ (curves @ axes)
     grown = 1.0 + ratio * np.maximum(sizes, 0.0)
     taken = (along**2 * ratio / grown).sum(axis=1)
-    value = -residuals.shape[1] * (np.log(scale) + 0.5 * np.log(2.0 * np.pi))
+    value = -residuals.shape[1] * (np.log(scale) + HALF_LN_2PI)
     value -= 0.5 * (np.log(grown).sum(axis=1) + (squares - taken) / scale**2)
     return np.where(bad, np.nan, value)
 

@@ -33,7 +33,7 @@ from calib.inference.likelihood import (
     NORMAL,
     Noise,
     Serial,
-    Squares,
+    SumOfSquares,
     log_normal,
     noise_of,
     serial_of,
@@ -192,9 +192,9 @@ class Problem:
         return self.noise.student and self.bound.model.response == "log"
 
     @cached_property
-    def squares(self) -> Squares:
+    def squares(self) -> SumOfSquares:
         """Sums of squared residuals, on the scale of the response, of natural parameters."""
-        return Squares.of(self.bound, self.conditions, self.response)
+        return SumOfSquares.of(self.bound, self.conditions, self.response)
 
     @cached_property
     def serial(self) -> Serial | None:

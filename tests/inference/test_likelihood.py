@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
 import calib.inference.likelihood as module
-from calib.inference.likelihood import Squares, log_normal
+from calib.inference.likelihood import SumOfSquares, log_normal
 from calib.models import MODELS, BoundModel
 from tests.models.ranges import draw
 
@@ -43,7 +43,7 @@ FAST = [name for name in MODELS if not name.startswith("wong_reece")]
 @example(seed=8199, n=257, levels=3)
 def test_sums_are_those_over_all_rows(name: str, seed: int, n: int, levels: int | None) -> None:
     bound, theta, conditions, response = data(name, seed, n, levels=levels)
-    found = Squares.of(bound, conditions, response)
+    found = SumOfSquares.of(bound, conditions, response)
     expected, largest = plain(bound, theta, conditions, response), np.abs(response).max()
     # Of 3000 terms, each with a relative rounding error of some 1e-13 (Newton's tolerance) and that
     # of a response, and of a mean of them, which may be large beside its residual.
@@ -56,10 +56,10 @@ def test_sums_are_those_over_all_rows(name: str, seed: int, n: int, levels: int 
 
 def test_a_condition_is_evaluated_once_however_often_it_was_measured() -> None:
     bound, _, conditions, response = data("magic_formula_pressure", 1, 5000, levels=6)
-    squares = Squares.of(bound, conditions, response)
+    squares = SumOfSquares.of(bound, conditions, response)
     assert squares.n_distinct == len(set(zip(*conditions.values(), strict=True)))
-    assert sum(tile.response.size for tile in squares.tiles) == squares.n_distinct <= 36
-    assert sum(float(tile.repeats.sum()) for tile in squares.tiles) == 5000
+    assert sum(mean.size for _, mean, _ in squares.tiles) == squares.n_distinct <= 36
+    assert sum(float(repeats.sum()) for *_, repeats in squares.tiles) == 5000
 
 
 @pytest.mark.parametrize("name", ["magic_formula_pressure", "modified_bekker"])
@@ -70,25 +70,17 @@ def test_a_sum_does_not_depend_on_what_it_is_evaluated_with(
     bound, theta, conditions, response = data(name, 3, n)
     many = np.tile(theta, (40 if n > 1000 else 300, 1))
     monkeypatch.setattr(module, "TILE_CELLS", max(4096, n))
-    squares = Squares.of(bound, conditions, response)
+    squares = SumOfSquares.of(bound, conditions, response)
     together = squares(many)
     # Other vectors may change the order of a sum, or Newton's last step of the implicit model.
     for i in (0, 3, 6):
         np.testing.assert_allclose(squares(theta[i : i + 1])[0], together[i::7], rtol=1e-9)
 
 
-def test_threads_make_no_difference(monkeypatch: pytest.MonkeyPatch) -> None:
-    bound, theta, conditions, response = data("magic_formula_pressure", 4, 200_000)
-    one, two = (Squares.of(bound, conditions, response, threads=t) for t in (1, 2))
-    assert len(one.tiles) > 2
-    monkeypatch.setattr(module, "PARALLEL_CELLS", 1)
-    np.testing.assert_array_equal(one(theta), two(theta))
-
-
 def test_memory_is_bounded_by_the_tile() -> None:
     """Some arrays of the cells a tile holds, whatever the rows and vectors."""
     bound, theta, conditions, response = data("magic_formula_pressure", 5, 100_000)
-    squares = Squares.of(bound, conditions, response, threads=1)
+    squares = SumOfSquares.of(bound, conditions, response)
     many = np.tile(theta, (10, 1))
     tracemalloc.start()
     squares(many)
@@ -99,7 +91,7 @@ def test_memory_is_bounded_by_the_tile() -> None:
 
 def test_a_vector_without_a_value_does_not_touch_the_others() -> None:
     bound, theta, conditions, response = data("magic_formula_pressure", 6, 42)
-    squares = Squares.of(bound, conditions, response)
+    squares = SumOfSquares.of(bound, conditions, response)
     before = squares(theta)
     theta[2] = -1.0
     after = squares(theta)

@@ -103,7 +103,7 @@ def test_a_region_where_it_crashes_is_outside_the_posterior(tmp_path: Path) -> N
     kept = whole[whole < 0.6]
     nearest = min(run.theta[0] for run in emulation.failed)
     # At another s0 the edge is a little farther than the nearest that failed.
-    assert found.parameters["mu"].max() < nearest + 0.1 * whole.std() < whole.max()
+    assert found.parameters["mu"].max() < nearest + 0.3 * whole.std() < whole.max()
     assert abs(found.summary["mu"].mean - kept.mean()) < kept.std()
     write_failed(emulation.failed, simulated.simulator.parameters, tmp_path / "failed.csv")
     lines = (tmp_path / "failed.csv").read_text().splitlines()

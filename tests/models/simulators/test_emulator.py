@@ -120,7 +120,7 @@ def test_the_model_has_every_layout() -> None:
     own = {name: np.tile(v, (5, 1)) for name, v in NODES.items()}
     np.testing.assert_allclose(bound.mean_response(theta, own), flat)
     table = calib.table_from_arrays({**NODES, "drawbar_pull_kn": flat[0] + 0.01})
-    squares = calib.inference.problem.Squares.of(bound, NODES, table["drawbar_pull_kn"])
+    squares = calib.inference.problem.SumOfSquares.of(bound, NODES, table["drawbar_pull_kn"])
     expected = np.square(table["drawbar_pull_kn"] - flat).sum(axis=1)
     np.testing.assert_allclose(squares(theta), expected)
 
