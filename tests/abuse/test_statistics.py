@@ -198,25 +198,6 @@ def test_uneven_noise(tmp_path: Path) -> None:
     assert abs(slope.mean - 5.0 * slip.std()) < 4.0 * slope.sd
 
 
-@pytest.mark.slow
-def test_rows_that_are_alike_along_a_run(tmp_path: Path) -> None:
-    rng = np.random.default_rng(6)
-    noise = rng.standard_normal(N)
-    for i in range(1, N):
-        noise[i] = 0.9 * noise[i - 1] + np.sqrt(1.0 - 0.81) * noise[i]
-    rows = Rows.made(0.05 * noise)
-    independent = rows.calibrated()
-    found = warned(independent)
-    assert "neighbouring rows are alike" in found
-    assert 'correlated_along = "run_order"' in found
-    honest = rows.calibrated('\n[likelihood]\ncorrelated_along = "run_order"\n', tmp_path)
-    assert warned(honest) == ""
-    assert holds(honest)
-    # A level of 48 rows of which neighbours correlate by 0.9 is worth that of some three.
-    assert honest.summary["z_ref"].sd > 2.0 * independent.summary["z_ref"].sd
-    assert abs(honest.summary["rho"].mean - 0.9) < 4.0 * honest.summary["rho"].sd
-
-
 def written(rows: Rows, path: Path) -> Path:
     lines = ["slip_ratio,average_ground_pressure_kpa,rut_depth_mm"]
     columns = zip(rows.slip, rows.pressure, rows.rut, strict=True)
