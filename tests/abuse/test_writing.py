@@ -141,29 +141,23 @@ def refused(words: str, out: Path) -> str:
     return done.stderr
 
 
-@pytest.mark.parametrize("verb", [*AT_ONCE, *LANDING, *SMALL])
-def test_a_read_only_place_is_found_before_the_work(
-    verb: str, read_only: Path, no_work: None
-) -> None:
-    said = refused((AT_ONCE | LANDING | SMALL)[verb], read_only / "out")
-    assert str(read_only / "out") in said
-    assert "cannot be written" in said
-    assert list(read_only.iterdir()) == []
+def test_a_read_only_place_is_found_before_the_work(read_only: Path, no_work: None) -> None:
+    for verb, words in (AT_ONCE | LANDING | SMALL).items():
+        said = refused(words, read_only / "out")
+        assert str(read_only / "out") in said, verb
+        assert "cannot be written" in said, verb
+        assert list(read_only.iterdir()) == [], verb
 
 
-@pytest.mark.parametrize("verb", [*AT_ONCE, *LANDING])
-def test_a_full_disk_is_found_before_the_work(verb: str, full: Path, no_work: None) -> None:
-    said = refused((AT_ONCE | LANDING)[verb], full / "out")
-    assert str(full / "out") in said
-    assert "only 0.0 MB are left on its disk" in said
-    assert [path.name for path in full.iterdir()] == ["photos"]
-
-
-@pytest.mark.parametrize("verb", SMALL)
-def test_of_what_does_not_fit_nothing_is_left(verb: str, full: Path) -> None:
-    said = refused(SMALL[verb], full / "out")
-    assert "cannot be written (No space left on device)" in said
-    assert not [path for path in full.rglob("*") if path.is_file() and path.name != "photos"]
+def test_a_full_disk_is_found_before_the_work_and_leaves_nothing(full: Path, no_work: None) -> None:
+    for verb, words in (AT_ONCE | LANDING).items():
+        said = refused(words, full / "out")
+        assert str(full / "out") in said, verb
+        assert "only 0.0 MB are left on its disk" in said, verb
+        assert [path.name for path in full.iterdir()] == ["photos"], verb
+    for verb, words in SMALL.items():
+        assert "cannot be written (No space left on device)" in refused(words, full / "out"), verb
+        assert {path.name for path in full.rglob("*") if path.is_file()} == {"photos"}, verb
 
 
 def test_a_key_that_cannot_be_written_is_found_before_cases_are_made(
