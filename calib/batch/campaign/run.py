@@ -14,6 +14,7 @@ import tomllib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -191,35 +192,30 @@ class Summary:
         return tuple(n for n, numbers in self.numbers.items() if numbers.get("converged") is False)
 
 
-def summarise(plan: Plan, results: Path) -> Summary:
-    """Read what there is of a campaign."""
-    numbers = {}
-    for name in plan.tasks:
-        path = results / name / _NUMBERS
-        if path.exists():
-            numbers[name] = json.loads(path.read_bytes())
+def _summarise(plan: Plan, results: Path) -> Summary:
+    numbers = {
+        name: json.loads(path.read_bytes())
+        for name in plan.tasks
+        if (path := results / name / _NUMBERS).exists()
+    }
     failed = {n: e for n, e in failed_tasks(results).items() if n in plan.tasks}
     return Summary({n: task.kind for n, task in plan.tasks.items()}, numbers, failed)
 
 
-def write_summary(summary: Summary, folder: Path) -> None:
+def _write_summary(summary: Summary, folder: Path) -> None:
     """Write ``summary.json``, and for every kind of task a CSV of its name with a row for each."""
-    document = {
-        "schema": "calib/campaign/1",
-        "counts": summary.counts,
-        "tasks": {name: _entry(summary, name) for name in summary.kinds},
-    }
+    tasks: dict[str, dict[str, Any]] = {}
+    for name, kind in summary.kinds.items():
+        tasks[name] = {"kind": kind, "state": summary.state(name)}
+        if name in summary.failed:
+            tasks[name]["error"] = summary.failed[name]
+        if name in summary.numbers:
+            tasks[name]["numbers"] = summary.numbers[name]
+    document = {"schema": "calib/campaign/1", "counts": summary.counts, "tasks": tasks}
     write_whole(folder / "summary.json", json.dumps(document, indent=1) + "\n")
     for kind in dict.fromkeys(summary.kinds.values()):
         names = [name for name, its in summary.kinds.items() if its == kind]
         write_whole(folder / f"{kind}.csv", _table(summary, names))
-
-
-def _entry(summary: Summary, name: str) -> dict[str, Any]:
-    entry: dict[str, Any] = {"kind": summary.kinds[name], "state": summary.state(name)}
-    if name in summary.failed:
-        entry["error"] = summary.failed[name]
-    return entry | {"numbers": summary.numbers[name]} if name in summary.numbers else entry
 
 
 def _table(summary: Summary, names: list[str]) -> str:
@@ -244,47 +240,40 @@ def _flat(numbers: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, A
             yield f"{prefix}{key}", value
 
 
-def describe(tasks: Iterable[Task]) -> dict[str, dict[str, Any]]:
+def _records(tasks: Iterable[Task]) -> dict[str, dict[str, Any]]:
     """Return for every task all that its result depends on, hashes of its inputs among it."""
-    with_versions = versions()
-    hashes: dict[Path, str | None] = {}
+    made_with, digest = versions(), cache(_digest)
     return {
         task.name: {
-            "schema": "calib/task/1", "task": task.name, "kind": task.kind, "seed": task.seed,
+            "schema": "calib/task/1",
+            "task": task.name,
+            "kind": task.kind,
+            "seed": task.seed,
             "settings": dict(task.settings),
-            "inputs": {label: _hash(path, hashes) for label, path in task.inputs.items()},
-            "versions": with_versions,
+            "inputs": {label: digest(path) for label, path in task.inputs.items()},
+            "versions": made_with,
         }
         for task in tasks
-    }  # fmt: skip
+    }
 
 
-def _hash(path: Path, known: dict[Path, str | None]) -> str | None:
+def _digest(path: Path) -> str | None:
     """Return a file's hash; None for one that cannot be read, which fails when it is loaded."""
-    if path not in known:
-        try:
-            known[path] = sha256(path.read_bytes())
-        except OSError:
-            known[path] = None
-    return known[path]
+    try:
+        return sha256(path.read_bytes())
+    except OSError:
+        return None
 
 
-def discard_changed(
+def _discard_changed(
     records: Mapping[str, Mapping[str, Any]], results: Path, *, overwrite: bool
 ) -> None:
-    """Remove results that were made from something else than their task now says.
-
-    Raises
-    ------
-    CalibError
-        If there are any and they may not be removed.
-    """
-    changed = {}
-    for name, record in records.items():
-        if (results / name).exists():
-            what = _difference(record, results / name / _RECORD)
-            if what:
-                changed[name] = what
+    """Remove results that were made from something else than their task now says, if allowed."""
+    changed = {
+        name: what
+        for name, record in records.items()
+        if (results / name).exists() and (what := _difference(record, results / name / _RECORD))
+    }
     if changed and not overwrite:
         name, what = next(iter(changed.items()))
         raise CalibError(
@@ -354,8 +343,8 @@ def run_campaign(
         check_room(out)
     else:
         check_folder(out)
-    records = describe(plan.tasks.values())
-    discard_changed(records, results, overwrite=overwrite)
+    records = _records(plan.tasks.values())
+    _discard_changed(records, results, overwrite=overwrite)
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         (out / _PLAN).write_bytes(plan.text)
@@ -370,8 +359,8 @@ def run_campaign(
         )  # fmt: skip
     finally:
         # An interrupted campaign has a summary too.
-        summary = summarise(plan, results)
-        write_summary(summary, out)
+        summary = _summarise(plan, results)
+        _write_summary(summary, out)
     return summary
 
 
