@@ -141,7 +141,8 @@ def _local(workers: int) -> Iterator[Client]:
                 hint='in a script of yours, put the call below `if __name__ == "__main__":`',
             ) from error
         client = stack.enter_context(Client(cluster, set_as_default=False))
-        client.register_plugin(_UserFiles(loaded()))
+        if files := loaded():
+            client.register_plugin(_UserFiles(files))
         yield client
         # A worker that died is being replaced: Dask cannot close its nanny meanwhile.
         with suppress(TimeoutError):
