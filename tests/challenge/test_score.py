@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import norm
 
 from calib.errors import CalibError
 from calib.gap.batch import INPUTS, case_hashes
-from challenge.answers import CaseAnswer, CauseAnswer, auc
+from challenge.answers import CaseAnswer, CauseAnswer, _ranked, auc, read_answer
 from challenge.figures import levels_figure, reliability_figure
 from challenge.files import OUTPUT_COLUMNS
 from challenge.levels import LEVELS
@@ -362,3 +363,55 @@ def test_what_stated_probabilities_promise_is_what_comes_true_if_they_are_right(
         value, n = getattr(found, name).value, getattr(found, name).n
         assert abs(value - expected) < 4.0 * (expected * (1.0 - expected) / n) ** 0.5
     assert found.by_itself["top_1"] < 0.97
+
+
+def told_apart(tmp_path: Path, truth: str, **rival: Any) -> float | None:
+    return read_answer("case-000", entry(truth, "easy") | rival, tmp_path).told_apart
+
+
+def test_a_nearest_rival_is_the_chance_to_choose_the_truth(tmp_path: Path) -> None:
+    # Half the square of the distance is the expected log likelihood ratio.
+    found = told_apart(tmp_path, "rate_effect", rival="lug_thrust", rival_nats=2.0)
+    assert found == pytest.approx(norm.cdf(1.0))
+    assert told_apart(tmp_path, "rate_effect", rival="lug_thrust", rival_nats=0.0) == 0.5
+    assert told_apart(tmp_path, "parameter_shift", rival="", rival_nats=None) == 1.0
+    # A null and keys that do not say are left out; keys of before named a shift as its own rival.
+    assert told_apart(tmp_path, "none", rival="", rival_nats=0.0) is None
+    assert told_apart(tmp_path, "rate_effect") is None
+    own = {"rival": "parameter_shift", "rival_nats": 1.0}
+    assert told_apart(tmp_path, "parameter_shift", **own) is None
+
+
+def test_listed_causes_with_something_unlisted_besides_are_those_causes():
+    said = {"lug_thrust+unknown": 0.4, "lug_thrust": 0.3, "b+a": 0.1, "unknown": 0.2}
+    effects = [{"name": name, "probability": p} for name, p in said.items()]
+    ranked = _ranked({"effects": effects})
+    assert dict(ranked) == pytest.approx({"lug_thrust": 0.7, "unknown": 0.2, "a+b": 0.1})
+    assert ranked[0][0] == "lug_thrust"
+
+
+def mixed(weak: float, ranked: dict[str, float]) -> CaseAnswer:
+    """Return the answer to a case of two causes, the second of which adds so many noise sds."""
+    causes = tuple(
+        CauseAnswer(name, 0.5, sds, 0.5, (0.0, 1.0))
+        for name, sds in (("lug_thrust", 8.0), ("rut_rebound", weak), ("force_offset", 0.0))
+    )
+    said = tuple(sorted(ranked.items(), key=lambda item: -item[1]))
+    return CaseAnswer(
+        "case-000", "large", "lug_thrust+rut_rebound", "effect", said, None, (), (), causes=causes
+    )
+
+
+def test_a_cause_too_weak_to_be_asked_for_may_be_left_out():
+    ranked = {"lug_thrust": 0.9, "lug_thrust+rut_rebound": 0.06, "rut_rebound": 0.04}
+    found = mixed(1.2, ranked)
+    assert found.right == {"lug_thrust", "lug_thrust+rut_rebound"}
+    assert found.among_first(1)
+    assert not found.confidently_wrong()
+    assert found.truth_probability == pytest.approx(0.96)
+    assert found.brier == pytest.approx(2 * 0.04**2)
+    # One that adds more may not, nor may one be named that does not act.
+    missed = mixed(1.3, ranked)
+    assert not missed.among_first(1)
+    assert missed.confidently_wrong()
+    assert mixed(1.2, {"force_offset+lug_thrust": 0.95}).confidently_wrong()
