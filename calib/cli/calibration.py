@@ -164,7 +164,7 @@ def fit(
     from calib.report.study import HoldOut, read_and_split, validated
     from calib.report.verdict import keep_verdict, verdict
     from calib.validation.comparison import noise_preference
-    from calib.validation.validate import PARETO_K_MAX
+    from calib.validation.constants import PARETO_K_MAX
 
     chosen = get_model(model)
     ctx.with_resource(claimed(out, overwrite=overwrite))
@@ -371,8 +371,9 @@ def predict(
     from calib.data.checks import beyond_notes, check_conditions
     from calib.models.simulators.emulator import emulator_of
     from calib.report.comparison import load_stack, verdicts_of
-    from calib.validation.prediction import MIN_DEFINED, predict_stacked, prediction_columns
+    from calib.validation.constants import MIN_DEFINED
     from calib.validation.prediction import predict as predict_at
+    from calib.validation.prediction import predict_stacked, prediction_columns
 
     if (run / "comparison.json").exists():
         found, stack = load_stack(run)

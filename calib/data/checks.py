@@ -1,4 +1,4 @@
-"""Values that are unusual or as in another unit than their column says; columns misspelt.
+"""Checks of tables: units in doubt, columns misspelt, rows to fit and to hold out.
 
 A whole column that is as in another unit is refused where a model is to be fitted to it, and only
 warned of elsewhere; the user can say that it is right (`calib.data.table.CHECKED`).
@@ -7,53 +7,35 @@ warned of elsewhere; the user can say that it is right (`calib.data.table.CHECKE
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import PurePath
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.data.files import plain_number
 from calib.data.quantities import QUANTITIES, Quantity, columns_of, convert
-from calib.data.table import CHECKED, Table, accepted_headers, columns_meant
+from calib.data.table import CHECKED, Table, accepted_headers, columns_meant, parse_header
 from calib.errors import CalibError
 
 type Array = NDArray[np.float64]
 
-# A psi is so many kPa; levels of a design that are so far apart to this part are no coincidence.
-_PSI, _NEAR, _FEW_LEVELS = 6.894757, 2e-3, 6
-_MOST_NAMED = 5
-# A column is too large if all but the largest tenth of it is.
-_MOST = 0.9
-# Refused are values that are, all of them, so many times beyond the usual, or the calibrated ones:
-# tyres of 3 psi are rare, tyres of 2 psi that would be usual in bar are in bar; and a model is used
-# beyond its range on purpose, by a factor.
-_FAR_FROM_USUAL, _FAR_FROM_KNOWN = 2.0, 10.0
-# Nearer to the unit of the header than this none is taken for it; units as near to each other as
-# that (bar, atm and kgf/cm2) are told as one.
-_OTHER, _SAME = 2.0, 1.2
-# A column that may be left out is asked after when its name is so like a known one.
-_ALIKE = 0.8
-# The pull of a wheel is a part of its load: small forces that agree on that are of a small wheel.
-_PULL_OVER_LOAD, _OF_SMALL_WHEELS = (0.01, 3.0), ("force", "torque")
+# Levels up to which values are taken for a design's; test_checks, test_assumptions.
+FEW_LEVELS = 6
+# Factor beyond the usual values, and beyond calibrated ones, from which values that would fit in
+# another unit are refused: tyres of 3 psi are rare, tyres of 2 psi that would be usual in bar are
+# in bar; and a model is used beyond its range on purpose, by a factor; test_checks.
+FAR_FROM_USUAL, FAR_FROM_KNOWN = 2.0, 10.0
+# Dimensions of which small wheels have less than vehicles' wheels.
+OF_SMALL_WHEELS = ("force", "torque")
 
 
-def unit_notes(table: Table, quantity: Quantity, values: Array) -> list[str]:
-    """Say which values (n,) of a condition are unusual, or as in another unit than the others."""
-    return [*_unusual(table, quantity, values), *_mixed_units(table, quantity, values)]
-
-
-@dataclass(frozen=True)
-class _Odd:
-    """A column that would be of usual size in another unit.
-
-    What was found in it, in its own unit; in which unit it would be usual, or what else may be the
-    matter; and whether no value of it is usual as it is.
-    """
+class _Odd(NamedTuple):
+    """A column that would be of usual size in another unit."""
 
     name: str
     found: str
-    hints: str
+    # Whether no value of it is usual as it is.
     whole: bool
 
 
@@ -68,10 +50,8 @@ def column_notes(table: Table) -> Iterator[str]:
     table : Table
     """
     for odd in _odd_columns(table):
-        yield (
-            f"{source_of(table)}, {table.header_of(odd.name)}: {odd.found}: {odd.hints}; check the "
-            "unit in the column name"
-        )
+        where = f"{source_of(table)}, {table.header_of(odd.name)}"
+        yield f"{where}: {odd.found}; check the unit in the column name"
 
 
 def check_units(table: Table, names: Iterable[str]) -> None:
@@ -86,21 +66,22 @@ def check_units(table: Table, names: Iterable[str]) -> None:
     used = set(names)
     for odd in _odd_columns(table):
         if odd.whole and odd.name in used:
-            raise _another_unit(table, odd.name, f"{odd.found}: {odd.hints}")
+            raise _another_unit(table, odd.name, odd.found)
     for name in used & set(table) & set(QUANTITIES):
         usual = QUANTITIES[name].usual
         values = table[name][np.isfinite(table[name])]
         if usual is None or not values.size or table.column(name).checked:
             continue
-        low, high = usual[0] / _FAR_FROM_USUAL, usual[1] * _FAR_FROM_USUAL
+        low, high = usual[0] / FAR_FROM_USUAL, usual[1] * FAR_FROM_USUAL
         far = bool((values < low).all() or (values > high).all())
         # Asked last, for the rarer units are pint's, which takes longer to start than a diagnosis.
         read = usual_in(table, name, values, *usual) if far else ""
         if read:
-            raise _another_unit(
-                table, name, f"all values are far from {_between(table, name, *usual)}, where they "
-                f"usually lie, and all would lie there if the readings are in {read}",
-            )  # fmt: skip
+            found = (
+                f"all values are far from {table.column(name).words(*usual)}, where they usually"
+            )
+            found += f" lie, and all would lie there if the readings are in {read}"
+            raise _another_unit(table, name, found)
 
 
 def check_conditions(table: Table, known: Mapping[str, Array]) -> None:
@@ -115,48 +96,42 @@ def check_conditions(table: Table, known: Mapping[str, Array]) -> None:
     """
     for name, values in known.items():
         low, high = float(values.min()), float(values.max())
-        far = bool((np.abs(table[name]) > _FAR_FROM_KNOWN * max(abs(low), abs(high))).all())
+        far = bool((np.abs(table[name]) > FAR_FROM_KNOWN * max(abs(low), abs(high))).all())
         # What may be zero may be as near to it as one likes.
         if QUANTITIES[name].range.low_open:
-            far |= bool((table[name] < low / _FAR_FROM_KNOWN).all())
+            far |= bool((table[name] < low / FAR_FROM_KNOWN).all())
         read = usual_in(table, name, table[name], low, high) if far else ""
         if read and not table.column(name).checked:
-            raise _another_unit(
-                table, name, "all values are more than ten times beyond the calibrated ones, "
-                f"{_between(table, name, low, high)}, and all would lie among them if the readings "
-                f"are in {read}",
-            )  # fmt: skip
+            found = "all values are more than ten times beyond the calibrated ones, "
+            found += f"{table.column(name).words(low, high)}, and all would lie among them if the "
+            raise _another_unit(table, name, f"{found}readings are in {read}")
 
 
 def _another_unit(table: Table, name: str, found: str) -> CalibError:
     header, quantity = table.header_of(name), QUANTITIES[name]
-    load = ""
+    hint = (
+        "correct the unit in the column name; if the values are right as they are, say so there: "
+    )
+    hint += f"'{header} {CHECKED}'"
+    small = quantity.role == "output" and quantity.kind in OF_SMALL_WHEELS and quantity.largest
     if (
-        quantity.role == "output" and quantity.kind in _OF_SMALL_WHEELS and quantity.largest
-        and float(np.nanmax(np.abs(table[name]))) < quantity.largest[0]
+        small
+        and float(np.nanmax(np.abs(table[name]))) < small[0]
         and not any(column in table for column in columns_of("load"))
-    ):  # fmt: skip
+    ):
         # Without it, they would be compared with those of a vehicle's wheel.
-        load = ", and add the load of the small wheel that they are of: the column normal_load_kn"
+        hint += ", and add the load of the small wheel that they are of: the column normal_load_kn"
     return CalibError(
-        found, where=f"{table.source}, column {header!r}",
+        found,
+        where=f"{table.source}, column {header!r}",
         expected=f"the unit of the readings in the column name: {', '.join(quantity.units)}",
-        hint="correct the unit in the column name; if the values are right as they are, say so "
-        f"there: '{header} {CHECKED}'{load}",
-    )  # fmt: skip
-
-
-def _between(table: Table, name: str, low: float, high: float) -> str:
-    """Say a range in the unit of the file."""
-    column = table.column(name)
-    ends = column.written(np.array([low, high]))
-    return f"{plain_number(ends[0], 4)} to {plain_number(ends[1], 4)} {column.unit_word}".rstrip()
+        hint=hint,
+    )
 
 
 def fits_load(pull: float, load: float) -> bool:
-    """Whether a largest pull can be that of a wheel under a load, of one unit."""
-    low, high = _PULL_OVER_LOAD
-    return low * load < pull < high * load
+    """Whether a largest pull can be that of a wheel under a load, of one unit: a part of it."""
+    return 0.01 * load < pull < 3.0 * load
 
 
 def _odd_columns(table: Table) -> Iterator[_Odd]:
@@ -166,15 +141,13 @@ def _odd_columns(table: Table) -> Iterator[_Odd]:
         max((sizes[c] for c in columns_of(role) if c in sizes), default=0.0)
         for role in ("pull", "load")
     )
-    fits = fits_load(pull, load)
+    small_wheel = fits_load(pull, load)
     for name, size in sizes.items():
-        quantity = QUANTITIES[name]
-        if quantity.largest is None:
+        quantity, column = QUANTITIES[name], table.column(name)
+        low, high = quantity.largest or (-np.inf, np.inf)
+        if low <= size <= high or column.checked:
             continue
-        low, high = quantity.largest
-        if fits and quantity.kind in _OF_SMALL_WHEELS and size < low:
-            continue
-        if low <= size <= high or table.column(name).checked:
+        if small_wheel and quantity.kind in OF_SMALL_WHEELS and size < low:
             continue
         factor = 1e-3 if size > high else 1e3
         hints = [
@@ -185,16 +158,12 @@ def _odd_columns(table: Table) -> Iterator[_Odd]:
         hints += [f"as where the readings are in {read}"] * bool(read)
         sizes_of = np.abs(table[name][np.isfinite(table[name])])
         # One row that is far too large is that row's fault, not the column's.
-        alone = size > high and float(np.quantile(sizes_of, _MOST)) < high
+        alone = size > high and float(np.quantile(sizes_of, 0.9)) < high
         if hints and not alone:
-            column = table.column(name)
-            written = f"{plain_number(float(column.written(size)), 4)} {column.unit_word}".rstrip()
-            yield _Odd(
-                name, f"the largest {quantity.word} is {written}, and "
-                f"{_between(table, name, low, high)} is usual", "; ".join(hints),
-                # Of what is too large, small values (at little slip) are usual in any unit.
-                size < low or float(np.median(sizes_of)) > high,
-            )  # fmt: skip
+            found = f"the largest {quantity.word} is {column.words(size)}, and "
+            found += f"{column.words(low, high)} is usual: {'; '.join(hints)}"
+            # Of what is too large, small values (at little slip) are usual in any unit.
+            yield _Odd(name, found, size < low or float(np.median(sizes_of)) > high)
 
 
 def usual_in(table: Table, name: str, values: Array, low: float, high: float) -> str:
@@ -212,15 +181,17 @@ def usual_in(table: Table, name: str, values: Array, low: float, high: float) ->
     """
     quantity = QUANTITIES[name]
     own = float(convert(1.0, table.column(name).unit, quantity.unit))
-    told: dict[str, float] = {}
+    named: dict[str, float] = {}
     for unit in quantity.units.values():
         factor = float(convert(1.0, unit, quantity.unit)) / own
-        known = any(max(factor / f, f / factor) < _SAME for f in told.values())
-        if not known and max(factor, 1.0 / factor) >= _OTHER:
+        # Units as near to each other as bar, atm and kgf/cm2 are named once, and none that is
+        # near the unit of the header.
+        known = any(max(factor / f, f / factor) < 1.2 for f in named.values())
+        if not known and max(factor, 1.0 / factor) >= 2.0:
             read = factor * values
             if ((low <= read) & (read <= high)).all():
-                told[_written(unit)] = factor
-    return " or ".join(told)
+                named["fractions" if unit == "dimensionless" else unit.replace("**", "")] = factor
+    return " or ".join(named)
 
 
 def beyond_notes(table: Table, known: Mapping[str, Array]) -> Iterator[str]:
@@ -239,38 +210,41 @@ def beyond_notes(table: Table, known: Mapping[str, Array]) -> Iterator[str]:
         if not beyond.any():
             continue
         read = usual_in(table, name, table[name][beyond], low, high)
-        farthest = float(table.column(name).written(table[name][np.argmax(off)]))
+        column = table.column(name)
+        farthest = float(column.written(table[name][np.argmax(off)]))
         reach = "as far off as" if beyond.sum() > 1 else "="
         unit = f"; inside if the readings are in {read}; check the unit in the column name"
         yield (
             f"{table.source}, {lines_of(table, beyond)}: {table.header_of(name)} {reach} "
-            f"{plain_number(farthest, 4)}, calibrated from {_between(table, name, low, high)}"
+            f"{plain_number(farthest, 4)}, calibrated from {column.words(low, high)}"
             f"{unit if read else ''}"
         )
 
 
-def _written(unit: str) -> str:
-    return {"dimensionless": "fractions"}.get(unit, unit.replace("**", ""))
-
-
 def spelling_notes(table: Table) -> Iterator[str]:
     """Ask after columns that are not used, and are named nearly as one that the table lacks."""
-    for guess in columns_meant(table.ignored, [n for n in QUANTITIES if n not in table], _ALIKE):
+    for guess in columns_meant(table.ignored, [n for n in QUANTITIES if n not in table], 0.8):
         yield f"{source_of(table)}: a column is not used: {guess}"
 
 
-def _unusual(table: Table, quantity: Quantity, values: Array) -> Iterable[str]:
-    if quantity.usual is None or table.column(quantity.canonical).checked:
-        return
-    low, high = quantity.usual
+def unit_notes(table: Table, quantity: Quantity, values: Array) -> Iterator[str]:
+    """Say which values (n,) of a condition are unusual, or as in another unit than the others."""
+    name, source, word = quantity.canonical, source_of(table), word_of(table, quantity)
+    low, high = quantity.usual or (-np.inf, np.inf)
     odd = (values < low) | (values > high)
-    if odd.any():
-        read = usual_in(table, quantity.canonical, values, low, high)
+    if odd.any() and not table.column(name).checked:
+        read = usual_in(table, name, values, low, high)
         where = f", and all would be inside if the readings are in {read}" if read else ""
         yield (
-            f"{source_of(table)}, {lines_of(table, odd)}: {word_of(table, quantity)} is outside "
-            f"{_between(table, quantity.canonical, low, high)}, where it usually lies{where}; "
-            "check the unit in the column name"
+            f"{source}, {lines_of(table, odd)}: {word} is outside "
+            f"{table.column(name).words(low, high)}, where it usually lies{where}; check the unit "
+            "in the column name"
+        )
+    odd, way = mixed_units(quantity, values)
+    if odd.any():
+        yield (
+            f"{source}, {lines_of(table, odd)}: {word} is 6.895 times {way} than in other rows, as "
+            "where psi and kPa were mixed up; check the unit"
         )
 
 
@@ -281,7 +255,7 @@ def stretches(values: Array) -> list[tuple[float, float]]:
     """
     levels = np.unique(values)
     low, high = float(levels[0]), float(levels[-1])
-    if levels.size > _FEW_LEVELS:
+    if levels.size > FEW_LEVELS:
         i = int(np.argmax(np.diff(levels)))
         if levels[i + 1] - levels[i] > 0.5 * (high - low):
             return [(low, float(levels[i])), (float(levels[i + 1]), high)]
@@ -294,23 +268,14 @@ def mixed_units(quantity: Quantity, values: Array) -> tuple[NDArray[np.bool_], s
     Values (n,) are of a few levels; among many, ratios come about by chance.
     """
     levels, none = np.unique(values), np.zeros(values.size, dtype=np.bool_)
-    if quantity.kind != "pressure" or not 2 <= levels.size <= _FEW_LEVELS or levels[0] <= 0.0:
+    if quantity.kind != "pressure" or not 2 <= levels.size <= FEW_LEVELS or levels[0] <= 0.0:
         return none, ""
     ratio = levels[None, :] / levels[:, None]
-    pairs = np.abs(ratio / _PSI - 1.0) < _NEAR
+    # A psi is so many kPa.
+    pairs = np.abs(ratio / 6.894757 - 1.0) < 2e-3
     small, large = (np.isin(values, levels[pairs.any(axis=axis)]) for axis in (1, 0))
     # The fewer rows are the mistaken ones.
     return (large, "larger") if large.sum() < small.sum() else (small, "smaller")
-
-
-def _mixed_units(table: Table, quantity: Quantity, values: Array) -> Iterable[str]:
-    odd, way = mixed_units(quantity, values)
-    if not odd.any():
-        return
-    yield (
-        f"{source_of(table)}, {lines_of(table, odd)}: {word_of(table, quantity)} is 6.895 times "
-        f"{way} than in other rows, as where psi and kPa were mixed up; check the unit"
-    )
 
 
 def word_of(table: Table, quantity: Quantity) -> str:
@@ -329,8 +294,8 @@ def source_of(table: Table) -> str:
 def lines_of(table: Table, rows: NDArray[np.bool_]) -> str:
     """Name the lines of some rows, the first few of many."""
     lines: list[int] = table.lines[rows].tolist()
-    named = ", ".join(map(str, lines[:_MOST_NAMED]))
-    more = f" and {len(lines) - _MOST_NAMED} more" if len(lines) > _MOST_NAMED else ""
+    named = ", ".join(map(str, lines[:5]))
+    more = f" and {len(lines) - 5} more" if len(lines) > 5 else ""
     return f"{'line' if len(lines) == 1 else 'lines'} {named}{more}"
 
 
@@ -388,3 +353,64 @@ def check_varies(table: Table, column: str) -> None:
         expected="at least two different values: a constant column tells a model nothing",
         hint="check that the right column was written, or add measurements",
     )  # fmt: skip
+
+
+def hold_out(
+    table: Table, quantity_header: str, value: float, rel_tol: float = 1e-3
+) -> tuple[Table, Table]:
+    """Set aside the rows at one value of a quantity.
+
+    Parameters
+    ----------
+    table : Table
+    quantity_header : str
+        A column name in any unit, such as ``"inflation_pressure_psi"``; the data may have it in
+        another one.
+    value : float
+        The value to hold out, in that unit.
+    rel_tol : float
+        Relative difference up to which a row counts as at that value. 30 psi written as
+        207 kPa differs by 7e-4.
+
+    Returns
+    -------
+    rest, held : Table
+
+    Raises
+    ------
+    CalibError
+        If no row has that value, listing those present, or if every row has it.
+    """
+    column = parse_header(quantity_header)
+    if column is None or column.quantity.canonical not in table:
+        guess = columns_meant(
+            [quantity_header], [n for n in table if n in QUANTITIES], shortened=True
+        )
+        raise CalibError(
+            f"there is no column to hold {quantity_header!r} out by", where=table.source,
+            expected=", ".join(table),
+            hint=" Or ".join([*guess, "name one of these quantities, with a unit"]),
+        )  # fmt: skip
+    values = table[column.quantity.canonical]
+    wanted = float(column.to_canonical(value))
+    scale = abs(wanted) or float(np.nanmax(np.abs(values)))
+    held = np.abs(values - wanted) <= rel_tol * scale
+    if held.any() and not held.all():
+        return table.take(~held), table.take(held)
+    where = f"{table.source}, column {quantity_header!r}"
+    if held.any():
+        raise CalibError(
+            f"every row is at {value:g}, so nothing would be left to fit",
+            where=where,
+            expected="a value that only some of the rows have",
+            hint="hold out something else",
+        )
+    levels = np.unique(values[~np.isnan(values)]) / column.to_canonical(1.0)
+    present = list(dict.fromkeys(f"{v:.6g}" for v in levels))
+    present[12:] = [f"and {len(present) - 12} more"] * (len(present) > 12)
+    raise CalibError(
+        f"no row is at {value:g}",
+        where=where,
+        expected=f"one of the values present: {', '.join(present)}",
+        hint="hold out one of these, or check the unit",
+    )

@@ -3,23 +3,114 @@
 from __future__ import annotations
 
 import codecs
-import contextlib
 import csv
+import hashlib
+import io
 import json
 import math
 import os
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calib.data.quantities import convert
 from calib.errors import FAULTS, CalibError
+
+
+@dataclass(frozen=True)
+class CsvFile:
+    """A file that can be read as CSV.
+
+    Lines are counted from 1, the hash is of the bytes. Rows that are not blank come with the number
+    of their line; the number of their cells is not checked.
+    """
+
+    source: str
+    header: tuple[str, ...]
+    header_line: int
+    delimiter: str
+    sha256: str
+    rows: Sequence[tuple[int, list[str]]]
+
+
+def _no_csv(found: str, where: str, hint: str) -> CalibError:
+    expected = "a CSV file in UTF-8: a line of column names, then one line per row"
+    return CalibError(found, where=where, expected=expected, hint=hint)
+
+
+def open_csv(path: str | os.PathLike[str]) -> CsvFile:
+    """Read a file and split it into cells.
+
+    Raises
+    ------
+    CalibError
+        If it cannot be read, is not text in UTF-8, is empty or has no line of column names.
+    """
+    source = os.fspath(path)
+    raw = _read_bytes(source)
+    source = writable(source)
+    text = _decode(raw, source)
+    first = next((line for line in io.StringIO(text) if line.strip()), "")
+    delimiter = max(",;\t", key=first.count)
+    (line, header), *rows = [*_rows(text, delimiter, source)] or [(0, [])]
+    if not header:
+        raise _no_csv("the file is empty", source, "`calib template MODEL` writes an example")
+    if all(re.fullmatch(r"\s*[-+]?[\d.,]+(e[-+]?\d+)?\s*", cell, re.I) for cell in header):
+        raise _no_csv(
+            "the first line holds numbers, not column names",
+            f"{source}, line {line}",
+            "put a line of column names such as slip_ratio,drawbar_pull_kn on top",
+        )
+    names = tuple(cell.strip() for cell in header)
+    return CsvFile(source, names, line, delimiter, hashlib.sha256(raw).hexdigest(), rows)
+
+
+def _read_bytes(source: str) -> bytes:
+    try:
+        return Path(source).read_bytes()
+    except FileNotFoundError:
+        near = sorted(p.name for p in Path(source).parent.glob("*.csv"))[:5]
+        holds = f"; its folder holds {', '.join(near)}" if near else ""
+        raise _no_csv("there is no such file", source, f"check the path{holds}") from None
+    except IsADirectoryError:
+        hint = "name a CSV file inside it"
+        raise _no_csv("this is a folder, not a file", source, hint) from None
+    except (OSError, ValueError) as error:
+        hint = "check the path and the permissions"
+        raise _no_csv(f"the file cannot be read ({error})", source, hint) from None
+
+
+def _decode(raw: bytes, source: str) -> str:
+    hint = "save it again as CSV in UTF-8 (Excel: `CSV UTF-8`)"
+    try:
+        text = decoded(raw)
+    except UnicodeDecodeError as error:
+        line = raw.count(b"\n", 0, error.start) + 1
+        found = f"byte 0x{raw[error.start]:02x} is not {error.encoding.upper()}"
+        raise _no_csv(found, f"{source}, line {line}", hint) from None
+    if raw.startswith(b"PK\x03\x04") or "\x00" in text:
+        raise _no_csv("this is a binary file, such as a workbook, not text", source, hint)
+    return text
+
+
+def _rows(text: str, delimiter: str, source: str) -> Iterator[tuple[int, list[str]]]:
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)
+    try:
+        for row in reader:
+            if any(map(str.strip, row)):
+                yield reader.line_num, row
+    except csv.Error as error:
+        raise _no_csv(
+            f"the line cannot be split into cells ({error})",
+            f"{source}, line {reader.line_num}",
+            "look for a quotation mark that is opened and not closed",
+        ) from None
 
 
 def write_table(
@@ -64,7 +155,7 @@ def write_table(
             hint="make the folder, change its permissions or name another file",
         ) from None  # fmt: skip
     finally:
-        with contextlib.suppress(OSError):
+        with suppress(OSError):
             scratch.unlink(missing_ok=True)
 
 
@@ -75,13 +166,6 @@ def _format(values: ArrayLike | Sequence[str]) -> list[str]:
     if array.dtype.kind != "f":
         return [str(int(value)) for value in array.tolist()]
     return ["" if math.isnan(value) else repr(value) for value in array.tolist()]
-
-
-# By the marks that such texts begin with; UTF-16's is the beginning of UTF-32's.
-_ENCODINGS = {
-    codecs.BOM_UTF32_LE: "utf-32", codecs.BOM_UTF32_BE: "utf-32",
-    codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16",
-}  # fmt: skip
 
 
 # Of a file that is not valid TOML.
@@ -96,8 +180,12 @@ def decoded(raw: bytes, errors: str = "strict") -> str:
     UnicodeDecodeError
         If it is not so encoded, unless `errors`, as of `bytes.decode`, says what to do then.
     """
-    marked = (name for mark, name in _ENCODINGS.items() if raw.startswith(mark))
-    return raw.decode(next(marked, "utf-8-sig"), errors)
+    # UTF-16's mark is the beginning of UTF-32's.
+    if raw.startswith((codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE)):
+        return raw.decode("utf-32", errors)
+    if raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return raw.decode("utf-16", errors)
+    return raw.decode("utf-8-sig", errors)
 
 
 def writable(name: str) -> str:
@@ -134,10 +222,6 @@ def inside(document: Any, *keys: str) -> dict[str, Any]:
     return document if isinstance(document, dict) else {}
 
 
-# From here on the digits before a power of ten are fewer than the zeros that it saves.
-_LARGE = 1e5
-
-
 def plain_number(value: float, digits: int = 3) -> str:
     """Write a number to some significant digits, without zeros that say nothing.
 
@@ -147,166 +231,36 @@ def plain_number(value: float, digits: int = 3) -> str:
     if "e" not in text or not math.isfinite(value):
         return text
     rounded = float(text)
-    return f"{rounded:.0f}" if 1.0 <= abs(rounded) < _LARGE else text
+    return f"{rounded:.0f}" if 1.0 <= abs(rounded) < 1e5 else text
 
 
 type Array = NDArray[np.float64]
 
-# What `float` takes beyond it ("1_000", digits of other scripts) is no number of a simulator's.
-# Fortran writes exponents with a D.
-_NUMBER = re.compile(
-    r"[-+]?(?:(?:\d+\.?\d*|\.\d+)(?:[eEdD][-+]?\d+)?|nan|inf(?:inity)?)", re.ASCII | re.IGNORECASE
-)
-_ONE = "dimensionless"
+
+def number_in(cell: str, decimal_comma: bool) -> float:
+    """Return the number in a cell; a ValueError of what was found and a hint if there is none."""
+    with suppress(ValueError):
+        if "_" not in cell:  # `float` takes 1_000 for a number, a reader of the file would not
+            return float(cell)
+    text = cell.strip().replace("\N{MINUS SIGN}", "-")
+    if text.lower() in {"", "na", "n/a", "null", "none"}:
+        return math.nan
+    if "," in text and (not decimal_comma or text.count(",") > 1 or "." in text):
+        raise ValueError(
+            f"{cell!r} has a comma inside a number",
+            "write numbers with a decimal point and no thousands separators, such as "
+            "1234 or 0.5 (decimal commas are read where semicolons separate the cells)",
+        )
+    with suppress(ValueError):
+        if "_" not in text:
+            return float(text.replace(",", "."))
+    raise ValueError(
+        f"{cell!r} is not a number",
+        "write one plain number, such as 0.05; the unit belongs in the column name",
+    )
 
 
-def real_array(found: Any, unit: str = _ONE) -> Array:
-    """Return numbers in a unit, in memory of their own and in the shape in which they came.
-
-    What carries a unit is converted from it, and what carries none is in `unit`. What is masked or
-    missing (None, NA) within an array is NaN: it has no value.
-
-    Raises
-    ------
-    CalibError
-        If it is none of real numbers, cannot be converted, or its order is not that of the rows.
-    """
-    if found is None:
-        raise _refused("it is nothing (None)", unit)
-    # Overflow of a wider type is infinite, which is no value.
-    with np.errstate(all="ignore"):
-        return _real(found, unit)
-
-
-def number_of(text: str) -> float:
-    """Return the number that a text is, with a decimal point; a CalibError if it is none."""
-    stripped = text.strip()
-    if not _NUMBER.fullmatch(stripped):
-        raise _refused(f"the text {text!r} is no number", _ONE)
-    return float(stripped.lower().replace("d", "e") if "n" not in stripped.lower() else stripped)
-
-
-def _real(found: Any, unit: str) -> Array:
-    if type(found) is np.ndarray:
-        return _of_array(found, unit)
-    if found is None or type(found).__name__ == "NAType":
-        return np.array(np.nan)
-    if isinstance(found, str):
-        return np.array(number_of(found))
-    if type(found) in (int, float):
-        return _of_scalar(found, unit)
-    _check_order(found, unit)
-    own = _unit_of(found)
-    if own is not None:
-        return convert(_real(_without_unit(found), _ONE), own, unit)
-    mask = getattr(found, "mask", None)
-    if isinstance(mask, np.ndarray | np.bool_):
-        return np.where(mask, np.nan, _real(np.where(mask, 0, np.asarray(found)), unit))
-    if isinstance(found, Sequence) and not isinstance(found, bytes | bytearray):
-        return _of_parts(found, unit)
-    inner = _inner(found)
-    if inner is not None:
-        return _real(inner, unit)
-    if isinstance(found, bool) or not hasattr(found, "__float__"):
-        raise _refused(f"it is of the type {type(found).__name__}", unit)
-    return _of_scalar(found, unit)
-
-
-def _of_scalar(found: Any, unit: str) -> Array:
-    try:
-        return np.array(float(found))
-    except (*FAULTS, ArithmeticError) as error:
-        what = f"{type(found).__name__} is no number of double precision ({error})"
-        raise _refused(what, unit) from None
-
-
-def _of_array(found: np.ndarray[Any, Any], unit: str) -> Array:
-    match found.dtype.kind:
-        case "f" | "i" | "u":
-            return found.astype(np.float64)
-        case "c":
-            missing = np.isnan(found)
-            imaginary = np.abs(np.where(missing, 0.0, found.imag))
-            if imaginary.any():
-                raise _refused(
-                    f"it is complex, with imaginary parts up to {imaginary.max():g}", unit
-                )
-            return np.where(missing, np.nan, found.real).astype(np.float64)
-        case "O" | "U":
-            return _of_parts(found.ravel().tolist(), unit).reshape(found.shape)
-        case _:
-            raise _refused(f"it is of the type {found.dtype}", unit)
-
-
-def _of_parts(found: Sequence[Any], unit: str) -> Array:
-    if {type(part) for part in found} <= {float, int}:
-        with suppress(OverflowError):
-            return np.array(found, dtype=np.float64)
-    parts = [_real(part, unit) for part in found]
-    shapes = {part.shape for part in parts}
-    if len(shapes) > 1:
-        raise _refused("its rows differ in length", unit)
-    return np.stack(parts) if parts else np.empty(0)
-
-
-def _inner(found: Any) -> Any:
-    """Return the array that something stands for, if any."""
-    if isinstance(found, np.ndarray | np.generic | complex):
-        return np.asarray(found)
-    # Labelled arrays hold others, which may have units; a conversion would lose them.
-    held = getattr(found, "data", None) if hasattr(found, "dims") else None
-    if held is not None and type(held) is not type(found):
-        return held
-    if not hasattr(found, "__array__"):
-        return None
-    try:
-        return np.asarray(found)
-    except (*FAULTS, ArithmeticError) as error:
-        raise _refused(f"{type(found).__name__} is no array of numbers ({error})", _ONE) from None
-
-
-def _unit_of(found: Any) -> str | None:
-    """Return the unit that something carries, as quantities of Pint, Astropy and unyt do."""
-    attributes = getattr(found, "attrs", None)
-    noted = attributes if isinstance(attributes, Mapping) else {}
-    for name in ("units", "unit"):
-        unit = noted.get(name, getattr(found, name, None))
-        if unit is not None and not callable(unit):
-            return _ONE if str(unit) in ("", "1") else str(unit)
-    return None
-
-
-def _without_unit(found: Any) -> Any:
-    for name in ("magnitude", "value"):
-        inner = getattr(found, name, None)
-        if inner is not None and not callable(inner):
-            return inner
-    if isinstance(found, np.ma.MaskedArray):
-        return np.ma.array(np.asarray(found), mask=np.ma.getmaskarray(found))
-    inner = _inner(found)
-    if inner is None:
-        raise _refused(f"{type(found).__name__} has a unit, but no numbers", _ONE)
-    return inner
-
-
-def _check_order(found: Any, unit: str) -> None:
-    """Check that the labels of what is labelled, as in pandas, are those of the rows in order."""
-    labels, axes = getattr(found, "indexes", None), getattr(found, "axes", None)
-    if isinstance(labels, Mapping):
-        axes = list(labels.values())
-    for axis in axes if isinstance(axes, list) else []:
-        with suppress(*FAULTS):
-            if np.array_equal(np.asarray(axis), np.arange(len(axis))):
-                continue
-        raise _refused(
-            f"its rows are labelled {', '.join(map(str, list(axis)[:3]))}, not 0, 1, 2 in order",
-            unit, "return them in the order of the conditions, without labels (to_numpy)",
-        )  # fmt: skip
-
-
-def _refused(what: str, unit: str, hint: str = "") -> CalibError:
-    plain = "real numbers" if unit == _ONE else f"real numbers in {unit}"
-    return CalibError(
-        what, expected=f"{plain}, or what has a unit of its own; NaN for no value",
-        hint=hint or f"return {plain} with a decimal point, or NaN where there is no value",
-    )  # fmt: skip
+def with_points(cells: Sequence[str]) -> tuple[str, ...]:
+    """Give numbers, of columns that are not used too, the decimal sign of what is written."""
+    number = re.compile(r"\s*[-+]?\d*,\d+(e[-+]?\d+)?\s*", re.IGNORECASE)
+    return tuple(c.replace(",", ".") if number.fullmatch(c) else c for c in cells)

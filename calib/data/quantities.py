@@ -1,63 +1,49 @@
 """Quantities: names, units and their conversion, physical roles, and how they are shown.
 
 It is the only vocabulary: inside the package every quantity has one canonical column in one unit,
-outputs are known by their stems, and effects know quantities by their physical roles. A new one is
-one declaration, made known by `calib.register`.
+outputs are known by their stems, and effects know quantities by their physical roles. The shipped
+ones stand in `quantities.toml`; a new one is one declaration, made known by `calib.register`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import re
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from math import inf
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Literal
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib.data.registry import Registry
-from calib.errors import CalibError
+from calib.errors import FAULTS, CalibError
 
-if TYPE_CHECKING:
-    import pint
+_SHIPPED = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+UNITS: Mapping[str, Mapping[str, str]] = _SHIPPED["units"]
 
 
 @cache
-def _registry() -> pint.UnitRegistry:
-    # Building the registry takes longer than all else in this module, and data in canonical
-    # units never need it.
-    import pint
+def _pint() -> Any:
+    import pint  # late: it takes longer to start than a diagnosis to draw
 
-    return pint.UnitRegistry()
-
-
-# The usual units in SI, by definition: pint takes longer to start than a diagnosis to draw. All
-# others are asked of pint.
-_POUND, _INCH, _GRAVITY = 0.45359237, 0.0254, 9.80665
-_USUAL: Mapping[str, Mapping[str, float]] = {
-    "pressure": {
-        "Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "bar": 1e5, "psi": _POUND * _GRAVITY / _INCH**2,
-    },
-    "force": {"N": 1.0, "kN": 1e3, "lbf": _POUND * _GRAVITY, "kgf": _GRAVITY},
-    "length": {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": _INCH},
-    "ratio": {"dimensionless": 1.0, "percent": 1e-2},
-    "density": {"g/cm**3": 1e3, "kg/m**3": 1.0},
-    "speed": {"m/s": 1.0, "km/h": 1.0 / 3.6},
-}  # fmt: skip
+    return pint, pint.UnitRegistry()
 
 
 @cache
 def _factor(from_unit: str, to_unit: str) -> float:
-    """Return how many `to_unit` one `from_unit` is."""
-    for si in _USUAL.values():
-        if from_unit in si and to_unit in si:
-            # Fifteen digits drop the last-bit noise of chained definitions (999.9999999999999).
-            return float(f"{si[from_unit] / si[to_unit]:.15g}")
-    import pint
+    """Return how many `to_unit` one `from_unit` is.
 
-    registry = _registry()
+    Fifteen digits drop the last-bit noise of chained definitions (999.9999999999999).
+    """
+    for si in _SHIPPED["si"].values():
+        if from_unit in si and to_unit in si:
+            return float(f"{si[from_unit] / si[to_unit]:.15g}")
+    pint, registry = _pint()
     try:
         one, zero = (float(registry.Quantity(x, from_unit).m_as(to_unit)) for x in (1.0, 0.0))
     except (pint.UndefinedUnitError, pint.DefinitionSyntaxError) as error:
@@ -95,41 +81,151 @@ def convert(values: ArrayLike, from_unit: str, to_unit: str) -> NDArray[np.float
     if from_unit == to_unit:
         return array
     factor = _factor(from_unit, to_unit)
-    if factor >= 1.0:
-        return np.asarray(array * factor)
     # 57 percent is 57/100 = 0.57 to the last bit; 57 * 0.01 is not.
-    return np.asarray(array / _factor(to_unit, from_unit))
+    return np.asarray(array * factor if factor >= 1.0 else array / _factor(to_unit, from_unit))
 
 
-_RATIO = {"ratio": "dimensionless", "fraction": "dimensionless", "percent": "percent",
-          "pct": "percent"}  # fmt: skip
+# Fewer texts than `float` takes ("1_000", digits of other scripts); Fortran writes 1.5D3.
+_NUMBER = re.compile(
+    r"[-+]?(?:(?:\d+\.?\d*|\.\d+)(?:[eEdD][-+]?\d+)?|nan|inf(?:inity)?)", re.ASCII | re.IGNORECASE
+)
 
-# Suffixes are lower case, so each has one reading: mpa is MPa and mg_m3 is Mg/m3 (the milli
-# readings are absurd for soil).
-UNITS: Mapping[str, Mapping[str, str]] = MappingProxyType({
-    "slip": _RATIO,
-    "mass ratio": _RATIO | {"g_g": "dimensionless", "kg_kg": "dimensionless"},
-    "volume ratio": _RATIO | {"m3_m3": "dimensionless", "cm3_cm3": "dimensionless"},
-    "pressure": {
-        "kpa": "kPa", "psi": "psi", "bar": "bar", "mpa": "MPa", "pa": "Pa", "hpa": "hPa",
-        "mbar": "mbar", "atm": "atm", "ksi": "ksi", "kgf_cm2": "kgf/cm**2", "n_cm2": "N/cm**2",
-        "n_mm2": "N/mm**2", "kn_m2": "kN/m**2", "lbf_in2": "lbf/in**2",
-    },
-    "force": {"kn": "kN", "n": "N", "dan": "daN", "lbf": "lbf", "kgf": "kgf", "kip": "kip"},
-    "length": {"mm": "mm", "cm": "cm", "m": "m", "in": "inch", "inch": "inch", "ft": "ft"},
-    "speed": {
-        "m_s": "m/s", "km_h": "km/h", "kmh": "km/h", "kph": "km/h", "cm_s": "cm/s",
-        "mm_s": "mm/s", "ft_s": "ft/s", "in_s": "inch/s", "mph": "mph",
-    },
-    "density": {
-        "g_cm3": "g/cm**3", "kg_m3": "kg/m**3", "mg_m3": "Mg/m**3", "t_m3": "t/m**3",
-        "kg_dm3": "kg/dm**3", "kg_l": "kg/L", "g_ml": "g/mL", "g_cc": "g/cm**3",
-        "lb_ft3": "lb/ft**3", "pcf": "lb/ft**3",
-    },
-    "torque": {"knm": "kN*m", "nm": "N*m", "lbf_ft": "lbf*ft"},
-    "number": {},
-    "label": {},
-})  # fmt: skip
+
+def real_array(found: Any, unit: str = "dimensionless") -> NDArray[np.float64]:
+    """Return what a model or simulator gave as numbers in a unit, of any shape, copied.
+
+    What carries a unit is converted from it, and what carries none is in `unit`. What is masked or
+    missing (None, NA) within an array is NaN: it has no value.
+
+    Raises
+    ------
+    CalibError
+        If it is none of real numbers, cannot be converted, or its order is not that of the rows.
+    """
+    if found is None:
+        raise _refused("it is nothing (None)", unit)
+    with np.errstate(all="ignore"):  # overflow of a wider type is infinite, which is no value
+        return _real(found, unit)
+
+
+def _real(found: Any, unit: str) -> NDArray[np.float64]:
+    if found is None or type(found).__name__ == "NAType":
+        return np.array(np.nan)
+    if isinstance(found, str):
+        if not _NUMBER.fullmatch(found.strip()):
+            raise _refused(f"the text {found!r} is no number", unit)
+        return np.array(float(re.sub(r"(?<=[\d.])[dD]", "e", found)))
+    if type(found) is np.ndarray:
+        return _of_array(found, unit)
+    _check_order(found, unit)
+    own = _unit_of(found)
+    if own is not None:
+        return convert(_real(_without_unit(found), "dimensionless"), own, unit)
+    mask = getattr(found, "mask", None)
+    if isinstance(mask, np.ndarray | np.bool_):
+        return np.where(mask, np.nan, _real(np.where(mask, 0, np.asarray(found)), unit))
+    if isinstance(found, Sequence) and not isinstance(found, bytes | bytearray):
+        return _of_parts(found, unit)
+    inner = _inner(found)
+    if inner is not None:
+        return _real(inner, unit)
+    name = type(found).__name__
+    if isinstance(found, bool) or not hasattr(found, "__float__"):
+        raise _refused(f"it is of the type {name}", unit)
+    try:
+        return np.array(float(found))
+    except (*FAULTS, ArithmeticError) as error:
+        raise _refused(f"{name} is no number of double precision ({error})", unit) from None
+
+
+def _of_array(found: NDArray[Any], unit: str) -> NDArray[np.float64]:
+    match found.dtype.kind:
+        case "f" | "i" | "u":
+            return found.astype(np.float64)
+        case "c":
+            missing = np.isnan(found)
+            size = np.abs(np.where(missing, 0.0, found.imag)).max(initial=0.0)
+            if size > 0.0:
+                raise _refused(f"it is complex, with imaginary parts up to {size:g}", unit)
+            return np.where(missing, np.nan, found.real).astype(np.float64)
+        case "O" | "U":
+            return _of_parts(found.ravel().tolist(), unit).reshape(found.shape)
+        case _:
+            raise _refused(f"it is of the type {found.dtype}", unit)
+
+
+def _of_parts(found: Sequence[Any], unit: str) -> NDArray[np.float64]:
+    parts = [_real(part, unit) for part in found]
+    if len({part.shape for part in parts}) > 1:
+        raise _refused("its rows differ in length", unit)
+    return np.stack(parts) if parts else np.empty(0)
+
+
+def _inner(found: Any) -> Any:
+    """Return the array that something stands for, if any."""
+    if isinstance(found, np.ndarray | np.generic | complex):
+        return np.asarray(found)
+    # Labelled arrays hold others, which may have units; a conversion would lose them.
+    held = getattr(found, "data", None) if hasattr(found, "dims") else None
+    if held is not None and type(held) is not type(found):
+        return held
+    if not hasattr(found, "__array__"):
+        return None
+    try:
+        return np.asarray(found)
+    except (*FAULTS, ArithmeticError) as error:
+        what = f"{type(found).__name__} is no array of numbers ({error})"
+        raise _refused(what, "dimensionless") from None
+
+
+def _unit_of(found: Any) -> str | None:
+    """Return the unit that something carries, as quantities of Pint, Astropy and unyt do."""
+    attributes = getattr(found, "attrs", None)
+    noted = attributes if isinstance(attributes, Mapping) else {}
+    for name in ("units", "unit"):
+        unit = noted.get(name, getattr(found, name, None))
+        if unit is not None and not callable(unit):
+            return "dimensionless" if str(unit) in ("", "1") else str(unit)
+    return None
+
+
+def _without_unit(found: Any) -> Any:
+    for name in ("magnitude", "value"):
+        inner = getattr(found, name, None)
+        if inner is not None and not callable(inner):
+            return inner
+    if isinstance(found, np.ma.MaskedArray):
+        return np.ma.array(np.asarray(found), mask=np.ma.getmaskarray(found))
+    inner = _inner(found)
+    if inner is None:
+        what = f"{type(found).__name__} has a unit, but no numbers"
+        raise _refused(what, "dimensionless")
+    return inner
+
+
+def _check_order(found: Any, unit: str) -> None:
+    """Check that the labels of what is labelled, as in pandas, are those of the rows in order."""
+    labels, axes = getattr(found, "indexes", None), getattr(found, "axes", None)
+    if isinstance(labels, Mapping):
+        axes = list(labels.values())
+    for axis in axes if isinstance(axes, list) else []:
+        with suppress(*FAULTS):
+            if np.array_equal(np.asarray(axis), np.arange(len(axis))):
+                continue
+        raise _refused(
+            f"its rows are labelled {', '.join(map(str, list(axis)[:3]))}, not 0, 1, 2 in order",
+            unit,
+            "return them in the order of the conditions, without labels (to_numpy)",
+        )
+
+
+def _refused(what: str, unit: str, hint: str = "") -> CalibError:
+    plain = "real numbers" if unit == "dimensionless" else f"real numbers in {unit}"
+    return CalibError(
+        what,
+        expected=f"{plain}, or what has a unit of its own; NaN for no value",
+        hint=hint or f"return {plain} with a decimal point, or NaN where there is no value",
+    )
 
 
 @dataclass(frozen=True)
@@ -162,7 +258,7 @@ class Range:
 
 @dataclass(frozen=True)
 class Quantity:
-    """One entry of the dictionary.
+    """One entry of the vocabulary.
 
     Parameters
     ----------
@@ -176,7 +272,7 @@ class Quantity:
         The canonical unit, in pint's spelling.
     role : {"output", "condition", "bookkeeping"}
     description : str
-        What it is, in plain words.
+        Its meaning in plain words.
     range : Range
         Values it can have.
     synonyms : tuple of str
@@ -185,7 +281,7 @@ class Quantity:
         Unit of a header without a suffix; None where the suffix is compulsory.
     log_scale : bool
         Whether the models compare its logarithm, so that it must be positive when used.
-    mend : str
+    hint : str
         What to do about a value outside the range.
     title : str
         Its name on an axis and as a heading; the stem in words by default.
@@ -235,6 +331,11 @@ class Quantity:
         return UNITS.get(self.kind, {}) if self.suffixes is None else self.suffixes
 
     @property
+    def stems(self) -> tuple[str, ...]:
+        """Its stem and the synonyms."""
+        return self.stem, *self.synonyms
+
+    @property
     def word(self) -> str:
         """Its name in a sentence."""
         return self.stem.replace("_", " ")
@@ -278,9 +379,8 @@ class Quantity:
                 expected=f"{self.stem} and a suffix of the unit: {', '.join(self.units)}",
                 hint="correct the canonical column",
             )
-        mine = {self.stem, *self.synonyms}
         for other in QUANTITIES.values():
-            taken = mine & {other.stem, *other.synonyms}
+            taken = set(self.stems) & set(other.stems)
             if taken and other.canonical != self.canonical:
                 raise CalibError(
                     f"columns called {min(taken)} are those of {other.stem} already",
@@ -291,98 +391,17 @@ class Quantity:
         QUANTITIES.add(self)
 
 
-_POSITIVE = Range(low=0.0, low_open=True)
-_SLIP = Range(low=-1.0, high=1.0)
-_ONE = "dimensionless"
+def _shipped() -> Iterator[Quantity]:
+    for stem, entry in _SHIPPED["quantities"].items():
+        fields: dict[str, Any] = {
+            key: tuple(value) if isinstance(value, list) else value for key, value in entry.items()
+        }
+        yield Quantity(stem, **(fields | {"range": Range(**entry.get("range", {}))}))
 
 
 QUANTITIES: Registry[Quantity] = Registry(
-    "quantity",
-    lambda quantity: quantity.canonical,
-    Quantity("bulk_density", "bulk_density_g_cm3", "density", "g/cm**3", "output",
-             "dry mass of soil over its volume", Range(low=0.3, high=3.5),
-             title="Dry bulk density", shown=("g/cm³", 1.0), physical="density"),
-    Quantity("drawbar_pull", "drawbar_pull_kn", "force", "kN", "output",
-             "net pull of the wheel; negative when it must be pushed", physical="pull",
-             largest=(0.15, 120.0)),
-    Quantity("rut_depth", "rut_depth_mm", "length", "mm", "output",
-             "depth of the rut, or sinkage", _POSITIVE, synonyms=("sinkage",),
-             log_scale=True, physical="sinkage", largest=(1.0, 1e3),
-             hint="the models compare the logarithm of the rut depth, which zero and negative "
-             "depths do not have: correct the zero of the gauge, or delete the row"),
-    Quantity("driving_torque", "driving_torque_knm", "torque", "kN*m", "output",
-             "torque that the axle gives to the wheel", shown=("kN m", 1.0),
-             largest=(0.1, 100.0)),
-    Quantity("shear_stress", "shear_stress_kpa", "pressure", "kPa", "output",
-             "shear force over the sheared area", Range(low=0.0), largest=(1.0, 1e3)),
-    Quantity("slip", "slip_ratio", "slip", _ONE, "condition",
-             "wheel slip, 1 - v/(ωr); 0.2 means 20 %", _SLIP, shown=("%", 100.0),
-             largest=(0.01, 1.0)),
-    Quantity("nominal_slip", "nominal_slip_ratio", "slip", _ONE, "bookkeeping",
-             "slip before its zero was redefined", _SLIP, shown=("%", 100.0),
-             largest=(0.01, 1.0)),
-    Quantity("inflation_pressure", "inflation_pressure_psi", "pressure", "psi", "condition",
-             "tyre inflation (gauge) pressure", _POSITIVE, physical="pressure",
-             usual=(6.0, 150.0)),
-    Quantity("average_ground_pressure", "average_ground_pressure_kpa", "pressure", "kPa",
-             "condition", "load over contact area", _POSITIVE, title="Ground pressure",
-             largest=(5.0, 5e3),
-             physical="ground_pressure"),
-    Quantity("normal_load", "normal_load_kn", "force", "kN", "condition",
-             "vertical load on the wheel", _POSITIVE, physical="load", of_factors=True,
-             synonyms=("load", "wheel_load", "vertical_load"), largest=(0.3, 200.0)),
-    Quantity("speed", "speed_m_s", "speed", "m/s", "condition",
-             "travel speed", Range(low=0.0), of_factors=True),
-    Quantity("pass_number", "pass_number", "number", _ONE, "condition",
-             "how often a wheel has run in this rut, the first time being 1",
-             Range(low=1.0, integer=True), bare_unit=_ONE, title="Pass", shown=("number", 1.0),
-             physical="passes", of_factors=True),
-    Quantity("run_order", "run_order", "number", _ONE, "bookkeeping",
-             "order in which the rows were measured", bare_unit=_ONE, shown=("number", 1.0),
-             physical="order"),
-    Quantity("repeat", "repeat", "label", _ONE, "bookkeeping",
-             "label of a repetition", synonyms=("replicate",), bare_unit=_ONE),
-    Quantity("run", "run", "label", _ONE, "bookkeeping",
-             "label of a test run", synonyms=("run_id",), bare_unit=_ONE),
-    Quantity("gravimetric_water_content", "gravimetric_water_content", "mass ratio", _ONE,
-             "condition", "mass of water over mass of dry soil", Range(low=0.0, high=3.0),
-             synonyms=("water_content_grav",), bare_unit=_ONE, title="Water content",
-             shown=("% of dry mass", 100.0), physical="water"),
-    Quantity("volumetric_water_content", "volumetric_water_content", "volume ratio", _ONE,
-             "condition", "volume of water over volume of soil", Range(low=0.0, high=1.0),
-             synonyms=("water_content_vol",), bare_unit=_ONE, title="Water content",
-             shown=("% of volume", 100.0), physical="water_by_volume"),
-    Quantity("cone_index", "cone_index_kpa", "pressure", "kPa", "condition",
-             "penetration resistance of a cone", _POSITIVE, physical="cone", of_factors=True,
-             synonyms=("penetration_resistance",), largest=(20.0, 15e3)),
-    Quantity("tyre_width", "tyre_width_m", "length", "m", "condition",
-             "width of the tyre's section, or of a rigid wheel", _POSITIVE, of_factors=True,
-             synonyms=("tire_width", "wheel_width", "section_width"), largest=(0.02, 2.0)),
-    Quantity("tyre_diameter", "tyre_diameter_m", "length", "m", "condition",
-             "outer diameter of the tyre or wheel, unloaded", _POSITIVE, of_factors=True,
-             synonyms=("tire_diameter", "wheel_diameter"), largest=(0.05, 5.0)),
-    Quantity("tyre_deflection", "tyre_deflection_mm", "length", "mm", "condition",
-             "how far the load flattens the tyre on hard ground", Range(low=0.0),
-             synonyms=("tire_deflection",), largest=(1.0, 500.0)),
-    Quantity("section_height", "section_height_mm", "length", "mm", "condition",
-             "height of the tyre's section, from rim to tread", _POSITIVE, of_factors=True,
-             largest=(20.0, 1e3)),
-    Quantity("contact_length", "contact_length_mm", "length", "mm", "condition",
-             "length of the contact of tyre and ground, along the way of travel", _POSITIVE,
-             of_factors=True, synonyms=("contact_patch_length",), largest=(10.0, 2e3)),
-    Quantity("contact_width", "contact_width_mm", "length", "mm", "condition",
-             "width of the contact of tyre and ground", _POSITIVE, of_factors=True,
-             synonyms=("contact_patch_width",), largest=(10.0, 2e3)),
-    Quantity("plate_width", "plate_width_mm", "length", "mm", "condition",
-             "smaller side of a rectangular plate; diameter of a round one", _POSITIVE,
-             of_factors=True, synonyms=("plate_diameter",), largest=(5.0, 2e3)),
-    Quantity("shear_displacement", "shear_displacement_mm", "length", "mm", "condition",
-             "how far the sheared soil has moved", Range(low=0.0), largest=(1.0, 1e3)),
-    Quantity("normal_stress", "normal_stress_kpa", "pressure", "kPa", "condition",
-             "normal force over the sheared area", Range(low=0.0), of_factors=True,
-             largest=(0.5, 2e3)),
-    group="terracalib.quantities",
-)  # fmt: skip
+    "quantity", lambda quantity: quantity.canonical, *_shipped(), group="terracalib.quantities"
+)
 
 
 class _Outputs(Mapping[str, str]):
@@ -404,14 +423,9 @@ class _Outputs(Mapping[str, str]):
 OUTPUTS: Mapping[str, str] = _Outputs()
 
 
-@cache
-def _columns_of(physical: str, _version: int) -> tuple[str, ...]:
-    return tuple(c for c, q in QUANTITIES.items() if physical in (q.physical, c))
-
-
 def columns_of(physical: str) -> tuple[str, ...]:
     """Return the canonical columns that have a physical role, or are named so themselves."""
-    return _columns_of(physical, QUANTITIES.version)
+    return tuple(c for c, q in QUANTITIES.items() if physical in (q.physical, c))
 
 
 def role_of(column: str) -> str:

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import FunctionType
-from typing import Protocol
+from typing import Any
 
 from calib.batch.user_code import PLUGINS, declared_in, fingerprint, load_installed
 from calib.errors import CalibError
@@ -51,10 +51,6 @@ def _interactive() -> bool:
     return not Path(getattr(sys.modules["__main__"], "__file__", "")).is_file()
 
 
-class _Declared(Protocol):
-    def register(self) -> None: ...
-
-
 class Registry[T](Mapping[str, T]):
     """Declarations by name, in the order in which they came.
 
@@ -68,11 +64,6 @@ class Registry[T](Mapping[str, T]):
         Those that are shipped.
     group : str, optional
         Entry points of installed packages that are loaded before any is looked up.
-
-    Attributes
-    ----------
-    version : int
-        Another one whenever what is known has changed.
     """
 
     def __init__(
@@ -80,7 +71,6 @@ class Registry[T](Mapping[str, T]):
     ) -> None:
         self._what, self._key, self._group = what, key, group
         self._known: dict[str, T] = {}
-        self.version = 0
         for one in declared:
             self.add(one)
 
@@ -104,11 +94,9 @@ class Registry[T](Mapping[str, T]):
                     "the other, start Python again",
                 )
         self._known |= new
-        self.version += 1
 
     def discard(self, name: str) -> None:
         """Forget a declaration, if there is one of this name."""
-        self.version += 1
         self._known.pop(name, None)
 
     def _all(self) -> dict[str, T]:
@@ -125,7 +113,7 @@ class Registry[T](Mapping[str, T]):
         return len(self._all())
 
 
-def register(*declared: _Declared) -> None:
+def register(*declared: Any) -> None:
     """Make quantities, models or effects known by their names.
 
     Raises

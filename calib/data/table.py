@@ -17,6 +17,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calib.data.files import plain_number
 from calib.data.quantities import QUANTITIES, UNITS, Quantity, convert
 from calib.errors import CalibError
 
@@ -28,17 +29,8 @@ _QUALIFIERS = frozenset({
     "level", "class", "method", "sensor", "channel", "time", "date",
 })  # fmt: skip
 
-# What tells repeats of a reading apart that stand side by side.
-_REPEAT = re.compile(r"(rep|repeat|replicate|run|test|trial|no)?\d*")
-
 # What a user puts behind a header whose values are to be believed as they are.
 CHECKED = "(checked)"
-
-
-def _stems() -> list[tuple[str, Quantity]]:
-    """Every stem and the quantity it names, the longest first."""
-    pairs = [(stem, q) for q in QUANTITIES.values() for stem in (q.stem, *q.synonyms)]
-    return sorted(pairs, key=lambda pair: -len(pair[0]))
 
 
 @dataclass(frozen=True)
@@ -67,6 +59,11 @@ class Column:
     def unit_word(self) -> str:
         """The unit as messages say it; empty for a plain number."""
         return "" if self.unit == "dimensionless" else self.unit.replace("**", "")
+
+    def words(self, *values: float) -> str:
+        """Canonical values in this column's unit as messages say them, such as 18 to 42 psi."""
+        said = " to ".join(plain_number(float(v), 4) for v in self.written(values))
+        return f"{said} {self.unit_word}".rstrip()
 
     @property
     def expected(self) -> str:
@@ -130,17 +127,23 @@ def names_quantity(header: str) -> bool:
 
 
 def _named(name: str) -> tuple[Quantity, str] | None:
-    """Return the quantity that a normal name begins with, and what follows."""
-    for stem, quantity in _stems():
-        if name == stem or (name.startswith(f"{stem}_") and quantity.units):
-            return quantity, name[len(stem) + 1 :]
-    return None
+    """Return the quantity that a normal name begins with, by its longest stem, and what follows."""
+    fits = [
+        (stem, quantity)
+        for quantity in QUANTITIES.values()
+        for stem in quantity.stems
+        if name == stem or (name.startswith(f"{stem}_") and quantity.units)
+    ]
+    if not fits:
+        return None
+    stem, quantity = max(fits, key=lambda pair: len(pair[0]))
+    return quantity, name[len(stem) + 1 :]
 
 
 def _is_repeat(suffix: str, quantity: Quantity) -> bool:
     """Whether a suffix is a unit and the number of a repeat (``1_n``, ``n_run_2``)."""
-    words = suffix.split("_")
-    rest = "_".join(word for word in words if not _REPEAT.fullmatch(word))
+    mark = re.compile(r"(rep|repeat|replicate|run|test|trial|no)?\d*")
+    rest = "_".join(word for word in suffix.split("_") if not mark.fullmatch(word))
     return rest != suffix and (rest in quantity.units or not rest)
 
 
@@ -215,23 +218,32 @@ def match_headers(
     ignored: list[str] = []
     errors: dict[str, CalibError] = {}
     for position, header in enumerate(headers):
+        quantity, suffix = _named(_normal(header)) or (None, "")
         try:
             column = parse_header(header, position=position)
         except CalibError as error:
             errors[header] = error
-            quantity, suffix = _named(_normal(header)) or (None, "")
-            if quantity and _is_repeat(suffix, quantity):
-                given.setdefault(quantity.canonical, []).append((position, header))
-            continue
-        if column is None:
-            ignored.append(header)
-            continue
-        given.setdefault(column.quantity.canonical, []).append((position, header))
-        found.setdefault(column.quantity.canonical, column)
+            if quantity is None or not _is_repeat(suffix, quantity):
+                continue
+        else:
+            if column is None:
+                ignored.append(header)
+                continue
+            found.setdefault(column.quantity.canonical, column)
+        if quantity is not None:
+            given.setdefault(quantity.canonical, []).append((position, header))
     if any(len(columns) > 1 for columns in given.values()):
         raise _side_by_side(given, where)
+    if len(errors) == 1:
+        raise next(iter(errors.values())).within(where)
     if errors:
-        raise _together(errors, where)
+        columns = f"columns {', '.join(map(repr, errors))}"
+        raise CalibError(
+            "; ".join(error.message for error in errors.values()),
+            where=f"{where}, {columns}" if where else columns,
+            expected="; ".join(error.expected or "" for error in errors.values()),
+            hint="; ".join(f"{header!r}: {error.hint}" for header, error in errors.items()),
+        )
     if missing := [name for name in required if name not in found]:
         raise missing_columns(missing, headers, ignored, where)
     return tuple(found.values()), tuple(ignored)
@@ -239,31 +251,19 @@ def match_headers(
 
 def _side_by_side(given: Mapping[str, list[tuple[int, str]]], where: str) -> CalibError:
     """Return the error of quantities that several columns give, (position, header) each."""
-    said, header = [], ""
-    for name, columns in given.items():
-        if len(columns) > 1:
-            *most, last = [f"{position + 1} ({column!r})" for position, column in columns]
-            header = columns[-1][1]
-            both = "both" if len(columns) == 2 else "all"
-            said.append(f"columns {', '.join(most)} and {last} {both} give {QUANTITIES[name].stem}")
+    several = {name: columns for name, columns in given.items() if len(columns) > 1}
+    said = []
+    for name, columns in several.items():
+        *most, last = [f"{position + 1} ({column!r})" for position, column in columns]
+        both = "both" if len(columns) == 2 else "all"
+        said.append(f"columns {', '.join(most)} and {last} {both} give {QUANTITIES[name].stem}")
     return CalibError(
-        "; ".join(said), where=_at(where, header), expected="one column per quantity",
+        "; ".join(said),
+        where=_at(where, [*several.values()][-1][-1][1]),
+        expected="one column per quantity",
         hint="of one reading in several units, delete or rename one; of repeats side by side, "
         "write each reading in a row of its own, below one another, with the conditions of its "
         "row copied and the number of the repeat in a column 'repeat'",
-    )  # fmt: skip
-
-
-def _together(errors: Mapping[str, CalibError], where: str) -> CalibError:
-    """Return one error of all headers whose units cannot be read: they are mended at once."""
-    if len(errors) == 1:
-        return next(iter(errors.values())).within(where)
-    said = "; ".join(error.message for error in errors.values())
-    allowed = "; ".join(error.expected or "" for error in errors.values())
-    hint = "; ".join(f"{header!r}: {error.hint}" for header, error in errors.items())
-    columns = f"columns {', '.join(map(repr, errors))}"
-    return CalibError(
-        said, where=f"{where}, {columns}" if where else columns, expected=allowed, hint=hint
     )
 
 
@@ -293,7 +293,7 @@ def missing_columns(
 
 
 def renamed(headers: Iterable[str], names: Iterable[str]) -> str:
-    """Begin a way to mend with what headers may have been meant to be; empty if nothing."""
+    """Begin a hint with what headers may have been meant to be; empty if nothing."""
     guesses = "; ".join(columns_meant(headers, names, shortened=True))
     return f"{guesses} Rename it, or " if guesses else ""
 
@@ -486,63 +486,3 @@ def _written_exactly(column: Column, values: NDArray[np.float64]) -> NDArray[np.
         shorter = np.array([float(f"{v:.{digits}g}") for v in written])
         written = np.where(column.to_canonical(shorter) == values, shorter, written)
     return written
-
-
-def hold_out(
-    table: Table, quantity_header: str, value: float, rel_tol: float = 1e-3
-) -> tuple[Table, Table]:
-    """Set aside the rows at one value of a quantity.
-
-    Parameters
-    ----------
-    table : Table
-    quantity_header : str
-        A column name in any unit, such as ``"inflation_pressure_psi"``; the data may have it in
-        another one.
-    value : float
-        The value to hold out, in that unit.
-    rel_tol : float
-        Relative difference up to which a row counts as at that value. 30 psi written as
-        207 kPa differs by 7e-4.
-
-    Returns
-    -------
-    rest, held : Table
-
-    Raises
-    ------
-    CalibError
-        If no row has that value, listing those present, or if every row has it.
-    """
-    column = parse_header(quantity_header)
-    if column is None or column.quantity.canonical not in table:
-        guess = columns_meant(
-            [quantity_header], [n for n in table if n in QUANTITIES], shortened=True
-        )
-        raise CalibError(
-            f"there is no column to hold {quantity_header!r} out by", where=table.source,
-            expected=", ".join(table),
-            hint=" Or ".join([*guess, "name one of these quantities, with a unit"]),
-        )  # fmt: skip
-    values = table[column.quantity.canonical]
-    wanted = float(column.to_canonical(value))
-    scale = abs(wanted) or float(np.nanmax(np.abs(values)))
-    held = np.abs(values - wanted) <= rel_tol * scale
-    if held.any() and not held.all():
-        return table.take(~held), table.take(held)
-    present = ", ".join(_distinct(values / column.to_canonical(1.0)))
-    where = f"{table.source}, column {quantity_header!r}"
-    if held.any():
-        raise CalibError(
-            f"every row is at {value:g}, so nothing would be left to fit", where=where,
-            expected="a value that only some of the rows have", hint="hold out something else",
-        )  # fmt: skip
-    raise CalibError(
-        f"no row is at {value:g}", where=where, expected=f"one of the values present: {present}",
-        hint="hold out one of these, or check the unit",
-    )  # fmt: skip
-
-
-def _distinct(values: NDArray[np.float64], most: int = 12) -> list[str]:
-    names = list(dict.fromkeys(f"{v:.6g}" for v in np.unique(values[~np.isnan(values)])))
-    return names if len(names) <= most else [*names[:most], f"and {len(names) - most} more"]

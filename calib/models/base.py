@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.batch.user_code import call
-from calib.data.files import MEND_TOML, real_array
-from calib.data.quantities import OUTPUTS, QUANTITIES, convert
+from calib.data.files import MEND_TOML
+from calib.data.quantities import OUTPUTS, QUANTITIES, convert, real_array
 from calib.errors import CalibError
 
 type Array = NDArray[np.float64]

@@ -58,8 +58,7 @@ from calib.validation.comparison import (
     difference,
     sentence,
 )
-from calib.validation.prediction import N_DRAWS
-from calib.validation.validate import PARETO_K_MAX
+from calib.validation.constants import N_DRAWS, PARETO_K_MAX
 
 
 def comparison_figure(comparison: Comparison) -> Figure:

@@ -24,7 +24,8 @@ from calib.report.rows import held_table, x_column
 from calib.report.study import HoldOut, OutputResult, Study
 from calib.report.verdict import judge_evidence
 from calib.validation.comparison import NoisePreference
-from calib.validation.scores import CONTRACTION_MIN, SENSITIVITY_MIN, Scores, role
+from calib.validation.constants import CONTRACTION_MIN, SENSITIVITY_MIN
+from calib.validation.scores import Scores, role
 
 SCHEMA = "calib/summary/1"
 

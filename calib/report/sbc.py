@@ -32,7 +32,8 @@ from calib.report.figures.style import (
 from calib.report.labels import MINUS, aligned, short, symbol
 from calib.report.numbers import finite
 from calib.report.page.template import data_uri, template
-from calib.validation.sbc import LEVEL, ModelScore, Quantity, SbcScore, ecdf_band
+from calib.validation.constants import LEVEL
+from calib.validation.sbc import ModelScore, Quantity, SbcScore, ecdf_band
 
 SCHEMA = "calib/sbc/1"
 _TITLES: Mapping[str, str] = {

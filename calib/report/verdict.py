@@ -31,6 +31,7 @@ from calib.report.labels import axis_of, joined, units_of
 from calib.report.page.template import words
 from calib.report.rows import Fitted, held_table, signs_along, x_column
 from calib.validation.assumptions import checks_of, remarks_of
+from calib.validation.constants import LEVEL
 from calib.validation.prediction import (
     binomial_p,
     coverage_probability,
@@ -38,7 +39,7 @@ from calib.validation.prediction import (
     hits,
     prior_predictive,
 )
-from calib.validation.residuals import LEVEL, Check, Range, Remark, failed
+from calib.validation.residuals import Check, Range, Remark, failed
 from calib.validation.scores import MOVED, PRIOR, role, standardise
 from calib.validation.validate import Validation
 

@@ -2,8 +2,9 @@
 
 Of each model the log predictive density of every row is found without that row (leave-one-out by
 smoothed importance sampling, by fitting again where its Pareto k is above 0.7), and of rows that
-were held out besides. Densities are of the output itself, whatever scale a model's noise is on, so
-that models of its logarithm can be compared with others.
+were held out. The noise of a calibration is compared with normal noise in the same way. Densities
+are of the output itself, whatever scale a model's noise is on, so that models of its logarithm can
+be compared with others.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import logsumexp
@@ -28,13 +30,8 @@ from calib.inference.random import generator
 from calib.inference.sampler import Progress, SamplerSettings
 from calib.models import get_model
 from calib.models.base import Array
+from calib.validation.constants import CLEAR, SMALL
 from calib.validation.validate import Validation, leave_one_out, validate_held_out
-
-# Differences of less are small whatever their standard error, which few rows then underestimate.
-SMALL = 4.0
-# A difference of more standard errors than this is called one.
-CLEAR = 2.0
-_MAX_ITERATIONS = 100_000
 
 type ComparisonProgress = Callable[[str, int, int], None]
 
@@ -59,8 +56,7 @@ class Candidate:
     @property
     def rows(self) -> Array:
         """Log predictive density of each fitted row without it, shape (n,)."""
-        found = self.loo.elpd_rows
-        return np.full(self.loo.observed.size, np.nan) if found is None else found
+        return _rows_of(self.loo)
 
     @property
     def sound(self) -> bool:
@@ -68,8 +64,11 @@ class Candidate:
         return self.calibration.converged and not self.loo.unconverged
 
 
-@dataclass(frozen=True)
-class Difference:
+def _rows_of(loo: Validation) -> Array:
+    return np.full(loo.observed.size, np.nan) if loo.elpd_rows is None else loo.elpd_rows
+
+
+class Difference(NamedTuple):
     """How far a model's expected log predictive density is below the best, and its error."""
 
     elpd: float
@@ -111,10 +110,8 @@ class Comparison:
     @property
     def sentence(self) -> str:
         """What the data prefer, and what they cannot tell, in plain words."""
-        return sentence(
-            {c.model: self.differences[c.model].clear for c in self.candidates},
-            [c.model for c in self.candidates if not c.sound],
-        )
+        told_apart = {model: d.clear for model, d in self.differences.items()}
+        return sentence(told_apart, [c.model for c in self.candidates if not c.sound])
 
 
 def sentence(told_apart: Mapping[str, bool], unsound: Sequence[str]) -> str:
@@ -208,24 +205,20 @@ def compare_problems(
     tell = progress or (lambda what, done, planned: None)
     found = [_candidate(p, held_out, seed, settings, tell, workers) for p in problems]
     for one in found:
-        _check_possible(one)
+        # One that has no density at a row would be infinitely worse.
+        rows = one.calibration.problem.table
+        empty = rows.lines[~np.isfinite(one.rows)]
+        if empty.size:
+            raise CalibError(
+                f"{one.model} gives {empty.size} of {len(rows)} rows no density",
+                where=f"{rows.source}, line {empty[0]}",
+                expected="rows that every model can have, however improbable",
+                hint="leave the model out, or the rows where it is not defined",
+            )
     weights = stacking_weights(np.stack([c.rows for c in found], axis=1))
     named = {c.model: float(w) for c, w in zip(found, weights, strict=True)}
     ranked = tuple(sorted(found, key=lambda c: -c.loo.elpd))
     return Comparison(ranked, {c.model: named[c.model] for c in ranked}, seed)
-
-
-def _check_possible(found: Candidate) -> None:
-    """Refuse a model that has no density at a row: it would be infinitely worse."""
-    table = found.calibration.problem.table
-    empty = table.lines[~np.isfinite(found.rows)]
-    if empty.size:
-        raise CalibError(
-            f"{found.model} gives {empty.size} of {len(table)} rows no density",
-            where=f"{table.source}, line {empty[0]}",
-            expected="rows that every model can have, however improbable",
-            hint="leave the model out, or the rows where it is not defined",
-        )
 
 
 def check_comparable(models: Sequence[str]) -> None:
@@ -281,7 +274,7 @@ def stacking_weights(elpd: Array) -> Array:
     """
     density = np.exp(elpd - elpd.max(axis=1, keepdims=True))
     weights = np.full(density.shape[1], 1.0 / density.shape[1])
-    for _ in range(_MAX_ITERATIONS):
+    for _ in range(100_000):
         mixed = density * weights
         new = (mixed / mixed.sum(axis=1, keepdims=True)).mean(axis=0)
         if np.abs(new - weights).max() < 1e-9:
@@ -386,13 +379,11 @@ def noise_preference(
         if done is None else done
         for c, done in ((calibration, loo), (usual, None))
     ]  # fmt: skip
-    rows = [np.full(p.observed.size, np.nan) if p.elpd_rows is None else p.elpd_rows for p in parts]
-    if not all(np.isfinite(r).all() for r in rows):
+    better = _rows_of(parts[0]) - _rows_of(parts[1])
+    if not np.isfinite(better).all():
         return NoisePreference(problem.noise, float("nan"), float("nan"), sound=False)
-    difference = rows[0] - rows[1]
     sound = all(c.converged for c in (calibration, usual)) and not any(p.unconverged for p in parts)
-    se = float(np.sqrt(difference.size * difference.var(ddof=1)))
-    elpd, most = float(difference.sum()), int(np.argmax(np.abs(difference)))
-    alone = 2.0 * abs(difference[most]) > abs(elpd)
-    line = int(problem.table.lines[most]) if alone else 0
+    elpd, se = difference(better)
+    most = int(np.argmax(np.abs(better)))
+    line = int(problem.table.lines[most]) if 2.0 * abs(better[most]) > abs(elpd) else 0
     return NoisePreference(problem.noise, elpd, se, sound, line)

@@ -9,7 +9,7 @@ for independent rows.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -19,22 +19,13 @@ from scipy.special import bdtr, ndtri
 from calib.batch.environment import one_thread
 from calib.data import Table
 from calib.data.checks import stretches
-from calib.data.table import parse_header
-from calib.errors import CalibError
 from calib.inference.random import generator
 from calib.models.base import Array
-from calib.validation.scores import LEVELS
+from calib.validation.constants import LEVELS, MIN_DEFINED, N_DRAWS
 
 if TYPE_CHECKING:
     from calib.inference.calibration import Calibration
     from calib.inference.problem import Problem
-
-N_DRAWS = 4000
-MIN_DEFINED = 0.95
-_ROWS_AT_ONCE = 2000
-_NOISE_REPEATS = 4
-_N_SMOOTH = 1000
-_N_PRIOR_PREDICTIVE = 1000
 
 
 @dataclass(frozen=True)
@@ -91,7 +82,7 @@ def predictive_draws(
 
 def prior_predictive(problem: Problem, rng: np.random.Generator) -> Array:
     """Return measurements that the priors expect at the calibrated rows, shape (draws, n)."""
-    natural = problem.theta(problem.priors.sample(rng, _N_PRIOR_PREDICTIVE))
+    natural = problem.theta(problem.priors.sample(rng, 1000))
     location = problem.draw_mean_response(natural, problem.conditions, rng)
     return problem.bound.from_response(location + problem.draw_noise(natural, rng))
 
@@ -148,10 +139,15 @@ def predict(calibration: Calibration, table: Table) -> Prediction:
     natural = problem.theta(calibration.subset(N_DRAWS))
     # The same noise draws for every row: its bands do not depend on the other rows.
     rng = generator(calibration.seed, calibration.label, "predict")
-    normals = tuple(_stratified_normals(rng, natural.shape[0]))
+    # Evenly spread over their quantiles, in random order, four for each draw of the parameters.
+    size = natural.shape[0]
+    normals = [
+        ndtri((rng.permutation(size) + rng.uniform(size=size)) / size)[:, None] for _ in range(4)
+    ]
     parts = []
-    for start in range(0, len(table), _ROWS_AT_ONCE):
-        rows = {name: v[start : start + _ROWS_AT_ONCE] for name, v in conditions.items()}
+    at_once = 2000  # rows; of 4000 draws each
+    for start in range(0, len(table), at_once):
+        rows = {name: v[start : start + at_once] for name, v in conditions.items()}
         # An emulator's error, too.
         error = generator(calibration.seed, calibration.label, "predict", "emulator")
         location = problem.draw_mean_response(natural, rows, error)
@@ -173,12 +169,6 @@ def predict(calibration: Calibration, table: Table) -> Prediction:
     )
 
 
-def _stratified_normals(rng: np.random.Generator, size: int) -> Iterator[Array]:
-    """Standard normals, evenly spread over their quantiles, in random order, (size, 1) each."""
-    for _ in range(_NOISE_REPEATS):
-        yield ndtri((rng.permutation(size) + rng.uniform(size=size)) / size)[:, None]
-
-
 def _join(parts: Sequence[Bands]) -> Bands:
     return Bands(
         np.concatenate([b.median for b in parts]),
@@ -189,11 +179,7 @@ def _join(parts: Sequence[Bands]) -> Bands:
 
 def bands(draws: Array) -> Bands:
     """Median and central bands of draws, shape (size, n)."""
-    edges = [
-        0.5,
-        *(0.5 - level / 2.0 for level in LEVELS),
-        *(0.5 + level / 2.0 for level in LEVELS),
-    ]
+    edges = [0.5, *(0.5 + half * level for half in (-0.5, 0.5) for level in LEVELS)]
     quantiles = np.quantile(draws, edges, axis=0)
     if np.isnan(quantiles).any():
         # A parameter vector for which the equation has no value there is left out, not spread;
@@ -218,7 +204,7 @@ def smooth_bands(
     """
     problem = calibration.problem
     rng = generator(calibration.seed, calibration.label, "figures")
-    t = problem.priors.sample(rng, _N_SMOOTH) if prior else calibration.subset(_N_SMOOTH)
+    t = problem.priors.sample(rng, 1000) if prior else calibration.subset(1000)
     natural = problem.theta(t)
     size = natural.shape[0]
     z = ndtri((rng.permutation(size) + 0.5) / size)[:, None]
@@ -241,10 +227,8 @@ def prediction_columns(prediction: Prediction, table: Table) -> dict[str, Array 
     output = prediction.output
     columns: dict[str, Array | list[str]] = echoed(table, output)
     columns[f"{output}_median"] = prediction.predictive.median
-    for kind, banded in (
-        ("parameter", prediction.parameter),
-        ("predictive", prediction.predictive),
-    ):
+    kinds = {"parameter": prediction.parameter, "predictive": prediction.predictive}
+    for kind, banded in kinds.items():
         for level in LEVELS:
             columns[f"{output}_{kind}_{100 * level:g}_lower"] = banded.lower[level]
             columns[f"{output}_{kind}_{100 * level:g}_upper"] = banded.upper[level]
@@ -261,26 +245,18 @@ def echoed(table: Table, *outputs: str) -> dict[str, Array | list[str]]:
 
     Long tables, whose text is not kept, come back in canonical columns.
     """
-    if table.text:
-        given = {h: [row[j] for row in table.text] for j, h in enumerate(table.header)}
-        return {h: v for h, v in given.items() if not _names(h, outputs)}
-    return {name: v for name, v in table.columns.items() if name not in outputs}
-
-
-def _names(header: str, outputs: Collection[str]) -> bool:
-    try:
-        column = parse_header(header)
-    except CalibError:
-        return False
-    return column is not None and column.quantity.canonical in outputs
+    if not table.text:
+        return {name: v for name, v in table.columns.items() if name not in outputs}
+    measured = {table.header_of(name) for name in outputs}
+    given = {h: [row[j] for row in table.text] for j, h in enumerate(table.header)}
+    return {h: cells for h, cells in given.items() if h not in measured}
 
 
 def outside(
     calibrated: Mapping[str, Array], conditions: Mapping[str, Array]
 ) -> tuple[tuple[str, ...], ...]:
     """Name, for each row of conditions, those that the calibrated ones do not cover."""
-    n = next(iter(conditions.values())).size
-    flags: list[list[str]] = [[] for _ in range(n)]
+    flags: list[list[str]] = [[] for _ in next(iter(conditions.values()))]
     for name, values in conditions.items():
         slack = 1e-9 * float(np.abs(calibrated[name]).max())
         covered = [
@@ -290,9 +266,6 @@ def outside(
         for i in np.flatnonzero(~np.any(covered, axis=0)):
             flags[i].append(name)
     return tuple(tuple(row) for row in flags)
-
-
-_MAX_REPLICATES = 2000
 
 
 def ks_distance(pit: Array) -> Array:
@@ -351,4 +324,4 @@ def _complete(draws: Array) -> Array:
 def _pit_of_draws(draws: Array) -> Array:
     good = _complete(draws)
     rank = good.argsort(axis=0).argsort(axis=0)
-    return np.asarray((rank[:_MAX_REPLICATES] + 0.5) / good.shape[0])
+    return np.asarray((rank[:2000] + 0.5) / good.shape[0])

@@ -21,7 +21,6 @@ from calib.data import Table, read_for_model, table_from_arrays
 from calib.data.registry import Registry
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration, calibrate
-from calib.inference.emulation import Emulation
 from calib.inference.emulation.prepared import emulated
 from calib.inference.emulation.state import EmulationSettings
 from calib.inference.estimators import estimate
@@ -34,8 +33,8 @@ from calib.models.base import Array, Conditions
 from calib.models.simulators.declaration import Simulated as SlowSimulator
 from calib.models.simulators.declaration import slow_simulator
 from calib.models.simulators.simulator import RunKeeper
+from calib.validation.constants import LEVELS
 from calib.validation.prediction import predict
-from calib.validation.scores import LEVELS
 
 
 @dataclass(frozen=True)
@@ -94,21 +93,18 @@ def design_of(model_name: str, data: Path | None = None) -> Design:
     """
     model = get_model(model_name)
     known = DESIGNS.get(model.name)
-    if data is not None:
-        design = _of_file(model, data, str(data))
+    if data is None and known is not None:
+        design = known.make()
+    elif data is None:
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / f"{model.name}.csv"
+            path.write_text(example_csv(model.name), encoding="utf-8")
+            design = _of_file(model, path, "the model's example")
     else:
-        design = known.make() if known is not None else _of_example(model)
+        design = _of_file(model, data, str(data))
     # For noise that is correlated along a run, if the priors ask for it.
     order = {"run_order": np.arange(1.0, len(design.table) + 1.0)}
     return replace(design, table=replace(design.table, columns=order | dict(design.table.columns)))
-
-
-def _of_example(model: Model) -> Design:
-    """The conditions of a model's own example."""
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / f"{model.name}.csv"
-        path.write_text(example_csv(model.name), encoding="utf-8")
-        return _of_file(model, path, "the model's example")
 
 
 def _of_file(model: Model, path: Path, where: str) -> Design:
@@ -117,9 +113,6 @@ def _of_file(model: Model, path: Path, where: str) -> Design:
     n = len(table)
     text = f"{n} conditions of {where}; held out: {n - 1} midway between them"
     return Design(model.name, table, held, text)
-
-
-_MOST_ATTEMPTS = 10_000
 
 
 @dataclass(frozen=True)
@@ -150,7 +143,7 @@ class Simulated:
 
 
 def simulate(
-    template: Problem, design: Design, rng: np.random.Generator, attempts: int = _MOST_ATTEMPTS
+    template: Problem, design: Design, rng: np.random.Generator, attempts: int = 10_000
 ) -> Simulated:
     """Simulate a campaign at the design's conditions.
 
@@ -164,18 +157,22 @@ def simulate(
     CalibError
         If the model has no value at the design, however often the prior is asked.
     """
-    bound = template.bound
+    bound, n_held = template.bound, next(iter(design.held.values())).size
     for attempt in range(1, attempts + 1):
         truth = template.priors.sample(rng, 1)
         natural = template.theta(truth)
-        noisy = _noisy(template, natural, template.conditions, template.draw_noise(natural, rng))[1]
-        apart = template.noise.draw(natural, design.held, rng, _count(design.held))
-        location, measured = _noisy(template, natural, design.held, apart)
+        noise = template.draw_noise(natural, rng)
+        apart = template.noise.draw(natural, design.held, rng, n_held)
+        _, noisy = _measured(template, natural, template.conditions, noise)
+        location, measured = _measured(template, natural, design.held, apart)
         if np.isfinite(noisy).all() and (bound.model.response != "log" or (noisy > 0.0).all()):
-            return Simulated(
-                truth[0], template.with_table(_measured(template, noisy)), design.held, location,
-                measured, attempt,
-            )  # fmt: skip
+            # Not checked as a file is: a prior may expect values that no instrument reads.
+            columns = {**template.table.columns, bound.model.output: noisy}
+            table = replace(
+                template.table, columns=columns, source="simulated", label="simulated", text=()
+            )
+            problem = template.with_table(table)
+            return Simulated(truth[0], problem, design.held, location, measured, attempt)
     raise CalibError(
         f"the prior of {bound.model.name} gave no data in {attempts} draws",
         where=template.priors.source,
@@ -183,7 +180,7 @@ def simulate(
     )
 
 
-def _noisy(
+def _measured(
     problem: Problem, natural: Array, conditions: Mapping[str, Array], noise: Array
 ) -> tuple[Array, Array]:
     """Output at some conditions and a measurement of it, each of shape (n,)."""
@@ -191,22 +188,6 @@ def _noisy(
     with np.errstate(over="ignore"):
         back = problem.bound.from_response
         return back(location), back(location + noise[0])
-
-
-def _count(conditions: Mapping[str, Array]) -> int:
-    return next(iter(conditions.values())).size
-
-
-def _measured(template: Problem, output: Array) -> Table:
-    # Not checked as a file is: a prior may expect values that no instrument reads.
-    columns = {**template.table.columns, template.bound.model.output: output}
-    return replace(template.table, columns=columns, source="simulated", label="simulated", text=())
-
-
-# Of which at least half has to have a value, or the emulation refuses.
-MOST_TRUTHS = 50
-# A truth is run at the conditions of the design and at those held out.
-_EACH_TRUTH = 2
 
 
 @dataclass(frozen=True)
@@ -220,25 +201,6 @@ class _Runs:
         empty = np.full(next(iter(conditions.values())).shape[-1], np.nan)
         runs = self.keeper.runs(theta, conditions)
         return np.stack([run.outputs[self.output] if run.ok else empty for run in runs])
-
-
-def run_each(
-    template: Problem, found: SlowSimulator, workers: int, scheduler: str | None
-) -> Problem:
-    """Return a problem that asks the simulator itself, to draw truths and their data from."""
-    keeper = RunKeeper(found.simulator, found.folder, workers, scheduler)
-    model = template.bound.model
-    # What is evaluated follows from the equation.
-    asking = replace(model, predict=_Runs(keeper, model.output), mean_response=None)
-    return replace(template, bound=replace(template.bound, model=asking))
-
-
-def emulate_campaign(
-    problem: Problem, held: Mapping[str, Array], seed: int, workers: int, scheduler: str | None
-) -> Emulation:
-    """Emulate the simulator for a simulated campaign as `calib fit` would for a measured one."""
-    elsewhere = table_from_arrays(dict(held), source="held out")
-    return emulated(problem, seed, elsewhere=[elsewhere], workers=workers, scheduler=scheduler)
 
 
 def most_runs(model: str, found: SlowSimulator, design: Design, simulations: int) -> str:
@@ -260,16 +222,12 @@ def most_runs(model: str, found: SlowSimulator, design: Design, simulations: int
     # Without a folder nothing is kept from one campaign to the next.
     shared = found.folder is not None and settings.sequential
     first = settings.spread(free, found.simulator.deterministic) if shared else 0
-    each = settings.runs - first + _EACH_TRUTH
+    # A truth is run at the conditions of the design and at those held out.
+    each = settings.runs - first + 2
     return (
         f"{model}: {first} runs that all campaigns share and at most {each} for each of "
         f"{simulations}, at most {first + each * simulations} runs of the simulator in all"
     )
-
-
-# Steps of each walker that are kept for ranks. The gate asks for 50 autocorrelation times, so five
-# steps are at least ten of them apart: as good as independent.
-_KEPT_STEPS = 5
 
 
 @dataclass(frozen=True)
@@ -304,9 +262,11 @@ def replicate(item: Item) -> dict[str, Any]:
     case = simulated(item)
     emulator_fails: tuple[str, ...] = ()
     if slow_simulator(item.model) is not None:
-        emulation = emulate_campaign(
-            case.problem, case.held, item.seed, item.workers, item.scheduler
-        )
+        held = table_from_arrays(case.held, source="held out")
+        emulation = emulated(
+            case.problem, item.seed, elsewhere=[held], workers=item.workers,
+            scheduler=item.scheduler,
+        )  # fmt: skip
         case, emulator_fails = replace(case, problem=emulation.problem), emulation.reasons
     calibration = calibrated(case, item)
     report = calibration.draws.report
@@ -315,7 +275,7 @@ def replicate(item: Item) -> dict[str, Any]:
         "index": item.index,
         "seed": item.seed,
         "attempts": case.attempts,
-        # Of a posterior by an emulator that is not good enough a user is told as much.
+        # A user is warned of a posterior by an emulator that is not good enough.
         "converged": report.passed and not emulator_fails,
         "reasons": [*report.reasons, *emulator_fails],
         "steps": report.steps,
@@ -332,8 +292,13 @@ def simulated(item: Item) -> Simulated:
     slow = slow_simulator(item.model)
     if slow is None:
         return simulate(template, design, rng)
-    asking = run_each(template, slow, item.workers, item.scheduler)
-    found = simulate(asking, design, rng, attempts=MOST_TRUTHS)
+    # Truths and their data are drawn from the simulator itself.
+    model = template.bound.model
+    keeper = RunKeeper(slow.simulator, slow.folder, item.workers, item.scheduler)
+    runs = replace(model, predict=_Runs(keeper, model.output), mean_response=None)
+    asking = replace(template, bound=replace(template.bound, model=runs))
+    # At least half of the prior has to have a value, or the emulation refuses.
+    found = simulate(asking, design, rng, attempts=50)
     return replace(found, problem=template.with_table(found.problem.table))
 
 
@@ -348,29 +313,37 @@ def calibrated(case: Simulated, item: Item) -> Calibration:
 
 def measure(case: Simulated, calibration: Calibration, design: Design) -> dict[str, Any]:
     """Rank the truth and count what the bands covered."""
-    return {
-        "design": design.text,
-        "ranks": ranks(case, calibration, design.watched),
-        **_coverage(case, calibration),
-    }
+    ranked = _ranks(case, calibration, design.watched)
+    return {"design": design.text, "ranks": ranked, **_coverage(case, calibration)}
 
 
-def ranks(case: Simulated, calibration: Calibration, watched: int) -> dict[str, list[int]]:
+def _ranks(case: Simulated, calibration: Calibration, watched: int) -> dict[str, list[int]]:
     """Rank the truth of every quantity among nearly independent posterior draws.
 
     Return draws below the truth, and draws; a quantity whose truth has no value is left out. A
     prediction is ranked at the held-out row `watched`.
     """
-    drawn = _quantities(calibration, _thinned(calibration.draws), case, watched)
-    true = _quantities(calibration, case.truth[None], case, watched)
+    problem, bound = calibration.problem, calibration.problem.bound
+    row = {name: v[watched : watched + 1] for name, v in case.held.items()}
+
+    def quantities(t: Array) -> dict[str, Array]:
+        natural = problem.theta(t)
+        theta = problem.of_model(natural)
+        entries = {p.name: natural[:, i] for i, p in enumerate(problem.priors.entries)}
+        known = {**bound.report(theta), **entries}
+        return {
+            **{name: known[name] for name in calibration.parameters},
+            "log_likelihood": problem.log_likelihood(t),
+            "prediction": bound.predict(theta, row)[:, 0],
+        }
+
+    thinned = _thinned(calibration.draws)
+    drawn, true = quantities(thinned), quantities(case.truth[None])
     rng = generator(calibration.seed, calibration.label, "measurement")
-    natural = calibration.problem.theta(_thinned(calibration.draws))
-    row = _row(case, watched)
-    response = calibration.problem.bound.to_response
     with np.errstate(all="ignore"):
-        noise = calibration.problem.noise.draw(natural, row, rng, 1)[:, 0]
-        noisy = response(drawn["prediction"]) + noise
-        drawn["measurement"] = calibration.problem.bound.from_response(noisy)
+        noise = problem.noise.draw(problem.theta(thinned), row, rng, 1)[:, 0]
+        noisy = bound.to_response(drawn["prediction"]) + noise
+        drawn["measurement"] = bound.from_response(noisy)
     # Of a slow simulator the truth is its run, which its emulator only comes near.
     true["prediction"] = case.location[watched : watched + 1]
     true["measurement"] = case.measured[watched : watched + 1]
@@ -385,34 +358,14 @@ def ranks(case: Simulated, calibration: Calibration, watched: int) -> dict[str, 
 
 
 def _thinned(draws: Draws) -> Array:
-    """All walkers at a few steps far apart, shape (ensembles * walkers * steps, d).
+    """All walkers at five steps far apart, shape (ensembles * walkers * steps, d).
 
-    Walkers of an ensemble are independent of each other at any one step of a stationary chain.
+    Walkers of an ensemble are independent of each other at any one step of a stationary chain. The
+    gate asks for 50 autocorrelation times, so the steps are at least ten of them apart.
     """
-    steps = np.linspace(0, draws.t.shape[2] - 1, min(_KEPT_STEPS, draws.t.shape[2]))
+    steps = np.linspace(0, draws.t.shape[2] - 1, min(5, draws.t.shape[2]))
     kept = draws.t[:, :, steps.round().astype(int)]
     return np.asarray(kept.reshape(-1, draws.t.shape[-1]))
-
-
-def _quantities(
-    calibration: Calibration, t: Array, case: Simulated, watched: int
-) -> dict[str, Array]:
-    """Everything that is ranked but the measurement, of internal coordinates (k, d): (k,) each."""
-    problem = calibration.problem
-    natural = problem.theta(t)
-    theta = problem.of_model(natural)
-    reported: Mapping[str, Array] = problem.bound.report(theta)
-    entries = {p.name: natural[:, i] for i, p in enumerate(problem.priors.entries)}
-    known = {**reported, **entries}
-    return {
-        **{name: known[name] for name in calibration.parameters},
-        "log_likelihood": problem.log_likelihood(t),
-        "prediction": problem.bound.predict(theta, _row(case, watched))[:, 0],
-    }
-
-
-def _row(case: Simulated, watched: int) -> dict[str, Array]:
-    return {name: v[watched : watched + 1] for name, v in case.held.items()}
 
 
 def _coverage(case: Simulated, calibration: Calibration) -> dict[str, Any]:
@@ -424,13 +377,12 @@ def _coverage(case: Simulated, calibration: Calibration) -> dict[str, Any]:
     bands = predict(calibration, table_from_arrays(rows, source="held out")).predictive
     given = np.isfinite(bands.median)
     measured = case.measured[defined]
+    inside = {
+        level: (measured >= bands.lower[level]) & (measured <= bands.upper[level])
+        for level in LEVELS
+    }
     return {
-        "covered": {
-            f"{100 * level:g}": int(
-                ((measured >= bands.lower[level]) & (measured <= bands.upper[level]))[given].sum()
-            )
-            for level in LEVELS
-        },
+        "covered": {f"{100 * level:g}": int(part[given].sum()) for level, part in inside.items()},
         "rows": int(given.sum()),
         "no_band": int((~given).sum()),
     }

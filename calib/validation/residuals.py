@@ -1,15 +1,15 @@
 """Tests of residuals at a fit, rows that lie far off, and the remarks that come of them.
 
 The likelihood takes rows as independent, and scattered as it says, about what the conditions of the
-model explain. `docs/statistics/likelihood.md` lists the tests.
+model explain. `docs/statistics/likelihood.md` lists the tests; `remarks.toml` has the words.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+import tomllib
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
-from pathlib import PurePath
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,12 +23,10 @@ from calib.data.quantities import OUTPUTS, QUANTITIES
 from calib.inference.mode import find_modes
 from calib.inference.problem import Problem
 from calib.models.base import Array
+from calib.validation.constants import FEWEST, FEWEST_IN_GROUP, LEVEL, OUTLYING_LEVEL
+from calib.validation.scores import holm
 
-# Chance that any test of a family fails on rows and priors that are as assumed.
-LEVEL = 0.05
-_FEWEST, _FEWEST_FOR_TAILS = 8, 20
-# Rows of a group whose scatter or mean is compared, at least.
-_FEWEST_IN_GROUP = 5
+_WORDS = tomllib.loads(Path(__file__).with_name("remarks.toml").read_text(encoding="utf-8"))
 
 
 class Range(NamedTuple):
@@ -77,15 +75,40 @@ class Check(NamedTuple):
     remark: Remark
 
 
+def remark(kind: str, *, where: tuple[Range, ...] = (), **fields: Any) -> Remark:
+    """Return the remark of a kind, a heading of `remarks.toml`, with the fields of its text."""
+    words = _WORDS[kind]
+    text = words["text"].format(**fields)
+    return Remark(text, words.get("title", ""), words.get("shifts", False), where)
+
+
 def failed(tests: Sequence[Check], level: float = LEVEL) -> tuple[Remark, ...]:
     """Return what the tests say that fail together, in their order, by Holm's (1979) procedure."""
-    ranked = sorted((t.p, i) for i, t in enumerate(tests))
-    fails: set[int] = set()
-    for rank, (p, i) in enumerate(ranked):
-        if not p < level / (len(tests) - rank):
-            break
-        fails.add(i)
-    return tuple(t.remark for i, t in enumerate(tests) if i in fails)
+    return tuple(
+        t.remark for t, p in zip(tests, holm([t.p for t in tests]), strict=True) if p < level
+    )
+
+
+def linear(problem: Problem, t: Array, used: NDArray[np.bool_]) -> tuple[Array, Array, int]:
+    """Residuals (n,), and the model made linear at a fit, orthonormal over the rows used.
+
+    Where the noise depends on a condition, over its scale there in units of sigma. The design is of
+    shape (n, rank), of directions that move predictions; the noise scale does not.
+    """
+    steps = 1e-5 * np.maximum(np.abs(t), 1.0)
+    moved = np.concatenate([t[None], t + np.diag(steps), t - np.diag(steps)])
+    natural = problem.theta(moved)
+    relative = problem.noise.scale(natural[:1], problem.conditions) / natural[0, -1]
+    residuals = problem.residuals(natural) / relative
+    # One-sided beside ground where the model has no value, as at the edge of an emulator.
+    ends = residuals[1:].reshape(2, t.size, -1)
+    there = np.isfinite(ends).all(axis=2)
+    ends = np.where(there[:, :, None], ends, residuals[0])
+    apart = np.maximum(there.sum(axis=0), 1) * steps
+    jacobian = ((ends[1] - ends[0]) / apart[:, None]).T
+    _, sizes, directions = np.linalg.svd(jacobian[used], full_matrices=False)
+    rank = int(np.sum(sizes > 1e-7 * max(float(sizes[0]), 1e-300)))
+    return residuals[0], jacobian @ directions[:rank].T / sizes[:rank], rank
 
 
 def residual_checks(problem: Problem, t: Array) -> tuple[Check, ...]:
@@ -97,7 +120,7 @@ def residual_checks(problem: Problem, t: Array) -> tuple[Check, ...]:
     """
     residual, design, rank = linear(problem, t, np.ones(problem.response.size, dtype=bool))
     left = residual.size - rank
-    if left < _FEWEST or not float(np.ptp(residual)) > 0.0:
+    if left < FEWEST or not float(np.ptp(residual)) > 0.0:
         return ()
     natural = problem.theta(t[None])
     raw = problem.residuals(natural)
@@ -111,15 +134,19 @@ def residual_checks(problem: Problem, t: Array) -> tuple[Check, ...]:
     return (
         *unexplained(problem.table, _unused(problem), studentised),
         *(() if problem.serial is not None else _autocorrelated(problem.table, score, design)),
-        *_uneven(problem, studentised), *_heavy_tailed(problem, studentised[judged]),
-    )  # fmt: skip
+        *_uneven(problem, studentised),
+        *_heavy_tailed(problem, studentised[judged]),
+    )
 
 
 def unexplained(
-    table: Table, columns: Mapping[str, NDArray[np.str_] | Array], residual: Array, *,
-    title: str = "A column explains the residuals",
+    table: Table,
+    columns: Mapping[str, NDArray[np.str_] | Array],
+    residual: Array,
+    *,
+    title: str = "",
     hint: str = "",
-) -> Iterable[Check]:  # fmt: skip
+) -> Iterator[Check]:
     """Whether residuals (n,), in noise sds, differ with a column of a table that is not used.
 
     Numbers by Spearman's rank correlation, and groups (of a category, of a number with few values,
@@ -127,58 +154,53 @@ def unexplained(
     """
     for header, cells in columns.items():
         numbers = _numbers(cells)
-        there = np.isfinite(residual) & (np.isfinite(numbers) | np.isnan(numbers).all())
-        if there.sum() < _FEWEST:
+        category = bool(np.isnan(numbers).all())
+        there = np.isfinite(residual) & (np.isfinite(numbers) | category)
+        if there.sum() < FEWEST:
             continue
-        found = []
         score, x = residual[there], numbers[there]
-        category = bool(np.isnan(x).all())
         names = cells[there] if category else np.array([plain_number(v) for v in x])
-        if not category and np.unique(x).size > 1:
-            found.append(scipy.stats.spearmanr(score, x).pvalue)
         levels, group, count = np.unique(names, return_inverse=True, return_counts=True)
-        remedy = hint or (
-            "fit each of its values by itself, or choose a model that has it as a condition"
-        )
-        if not category and count.min() < _FEWEST_IN_GROUP:
-            remedy = hint or (
+        remedy = "fit each of its values by itself, or choose a model that has it as a condition"
+        if not category and count.min() < FEWEST_IN_GROUP:
+            remedy = (
                 "choose a model that has it as a condition or, if the readings drift along the "
                 'runs, write correlated_along = "run_order" (a column) in the prior file'
             )
-            edges = np.quantile(x, [0.25, 0.5, 0.75])
-            group = np.searchsorted(edges, x)
-            named = [(x[group == i].min(), x[group == i].max()) for i in np.unique(group)]
-            levels = np.array([f"{plain_number(a)} to {plain_number(b)}" for a, b in named])
-            group = np.unique(group, return_inverse=True)[1]
-            count = np.bincount(group)
+            group = np.searchsorted(np.quantile(x, [0.25, 0.5, 0.75]), x)
+            group, count = np.unique(group, return_inverse=True, return_counts=True)[1:]
+            ends = [(x[group == i].min(), x[group == i].max()) for i in range(count.size)]
+            levels = np.array([f"{plain_number(a)} to {plain_number(b)}" for a, b in ends])
         # A category of one row each, as a remark, is none.
-        large = np.flatnonzero(count >= (2 if category else _FEWEST_IN_GROUP))
+        large = np.flatnonzero(count >= (2 if category else FEWEST_IN_GROUP))
         parts = [score[group == i] for i in large]
-        if len(parts) > 1 and sum(map(len, parts)) >= _FEWEST:
+        found = []
+        if not category and np.unique(x).size > 1:
+            found.append(scipy.stats.spearmanr(score, x).pvalue)
+        if len(parts) > 1 and sum(map(len, parts)) >= FEWEST:
             found.append(scipy.stats.kruskal(*parts).pvalue)
         if not found or len(parts) < 2:
             continue
         means = [float(part.mean()) for part in parts]
-        low, high = int(np.argmin(means)), int(np.argmax(means))
         p = min(1.0, len(found) * float(min(found)))
-        said = [
+        means_said = " and ".join(
             f"{means[i]:+.1f} noise sds where it is {levels[large[i]]} ({len(parts[i])} rows)"
-            for i in (high, low)
-        ]
-        yield Check(p, Remark(
-            f"{source_of(table)}: the residuals differ with {header!r}, a column that is not used: "
-            f"on average {' and '.join(said)} (p = {plain_number(p, 2)}); {remedy}",
-            title.format(header), shifts=True,
-        ))  # fmt: skip
+            for i in (int(np.argmax(means)), int(np.argmin(means)))
+        )
+        told = remark(
+            "unexplained", source=source_of(table), header=header, means=means_said,
+            p=plain_number(p, 2), remedy=hint or remedy,
+        )  # fmt: skip
+        yield Check(p, Remark(told.text, (title or told.title).format(header), told.shifts))
 
 
 def _unused(problem: Problem) -> dict[str, NDArray[np.str_] | Array]:
     """Columns of the file that neither the model nor the noise uses, other outputs left out."""
-    table, choice = problem.table, problem.noise.choice
+    choice = problem.noise.choice
     own = {*problem.conditions, *OUTPUTS.values(), problem.bound.model.output}
-    own |= {name for name in table if name in QUANTITIES
-            and QUANTITIES[name].stem in (choice.depends_on, choice.correlated_along)}  # fmt: skip
-    return unused(table, own)
+    noise = (choice.depends_on, choice.correlated_along)
+    own |= {n for n in problem.table if n in QUANTITIES and QUANTITIES[n].stem in noise}
+    return unused(problem.table, own)
 
 
 def unused(table: Table, own: Collection[str]) -> dict[str, NDArray[np.str_] | Array]:
@@ -205,7 +227,7 @@ def _numbers(cells: NDArray[np.str_] | Array) -> Array:
         return np.full(cells.size, np.nan)
 
 
-def _autocorrelated(table: Table, residual: Array, design: Array) -> Iterable[Check]:
+def _autocorrelated(table: Table, residual: Array, design: Array) -> Iterator[Check]:
     """Durbin and Watson's (1951) test in the order of the file, by their beta approximation."""
     n = residual.size
     d = float(np.square(np.diff(residual)).sum() / np.square(residual).sum())
@@ -214,14 +236,9 @@ def _autocorrelated(table: Table, residual: Array, design: Array) -> Iterable[Ch
     x, v = mean / 4.0, variance / 16.0
     size = x * (1.0 - x) / v - 1.0
     r = float(np.clip(1.0 - d / mean, 0.0, 0.99))
-    yield Check(float(scipy.stats.beta.cdf(d / 4.0, x * size, (1.0 - x) * size)), Remark(
-        f"{source_of(table)}: residuals of neighbouring rows are alike (correlation {r:.2f}), as "
-        "in rows of one continuous run, or where the curve misses a pattern; the rows are worth "
-        f"about {max(1.0, n * (1.0 - r) / (1.0 + r)):.0f} independent ones, not {n}, so that "
-        'widths are too narrow: correlated_along = "run_order" (a column) under [likelihood] in '
-        "the prior file widens them; or thin the rows, or look at the residuals",
-        "Rows depend on each other",
-    ))  # fmt: skip
+    worth = max(1.0, n * (1.0 - r) / (1.0 + r))
+    told = remark("dependent", source=source_of(table), r=r, worth=worth, n=n)
+    yield Check(float(scipy.stats.beta.cdf(d / 4.0, x * size, (1.0 - x) * size)), told)
 
 
 def durbin_watson_moments(design: Array) -> tuple[float, float]:
@@ -234,7 +251,8 @@ def durbin_watson_moments(design: Array) -> tuple[float, float]:
     """
     n, rank = design.shape
     left = n - rank
-    on_design = _second_difference(design)
+    steps = np.diff(design, axis=0, prepend=design[:1], append=design[-1:])
+    on_design = steps[:-1] - steps[1:]
     gram = design.T @ on_design
     p = 2.0 * (n - 1) - float(np.trace(gram))
     q = 2.0 * (3 * n - 4) - 2.0 * float(np.square(on_design).sum()) + float(np.square(gram).sum())
@@ -242,15 +260,7 @@ def durbin_watson_moments(design: Array) -> tuple[float, float]:
     return mean, 2.0 * (q - p * mean) / (left * (left + 2.0))
 
 
-def _second_difference(x: Array) -> Array:
-    steps = np.diff(x, axis=0)
-    out = np.zeros_like(x)
-    out[:-1] -= steps
-    out[1:] += steps
-    return out
-
-
-def _uneven(problem: Problem, residual: Array) -> Iterable[Check]:
+def _uneven(problem: Problem, residual: Array) -> Iterator[Check]:
     """Whether the scatter of residuals (n,) differs with a condition.
 
     By Levene's test, in Brown and Forsythe's form, where every value has its group of rows;
@@ -262,64 +272,41 @@ def _uneven(problem: Problem, residual: Array) -> Iterable[Check]:
         levels, group, count = np.unique(values, return_inverse=True, return_counts=True)
         if levels.size < 2 or name == problem.noise.column:
             continue
-        word, stem = word_of(problem.table, QUANTITIES[name]), QUANTITIES[name].stem
-        remedy = f'noise_depends_on = "{stem}" in the prior file lets it change'
-        remark = partial(Remark, title="Scatter is uneven")
-        if count.min() >= _FEWEST_IN_GROUP:
-            parts = [score[group == i] for i in range(levels.size)]
-            sd = np.array([part.std(ddof=1) for part in parts])
-            wide, tight = int(np.argmax(sd)), int(np.argmin(sd))
-            column, p = problem.table.column(name), float(scipy.stats.levene(*parts).pvalue)
-            at = [
-                f"{plain_number(float(column.written(levels[i])), 4)} {column.unit_word}".rstrip()
-                for i in (wide, tight)
-            ]
-            yield Check(p, remark(
-                f"{source_of(problem.table)}: the scatter differs with {word}: one sigma is too "
-                f"narrow at {at[0]}, where the residuals have an sd of {sd[wide]:.2f} sigma, and "
-                f"too wide at {at[1]} ({sd[tight]:.2f} sigma; p = {plain_number(p, 2)}): {remedy}",
-                where=tuple(_nearest(name, levels, i) for i in (wide, tight)),
-            ))  # fmt: skip
+        quantity, column = QUANTITIES[name], problem.table.column(name)
+        words: dict[str, Any] = {
+            "source": source_of(problem.table), "stem": quantity.stem,
+            "word": word_of(problem.table, quantity),
+        }  # fmt: skip
+        if count.min() < FEWEST_IN_GROUP:
+            found = scipy.stats.kendalltau(np.abs(score), values)
+            grows = "grows" if found.statistic > 0.0 else "falls"
+            told = remark("uneven_trend", grows=grows, tau=found.statistic, **words)
+            yield Check(float(found.pvalue), told)
             continue
-        found = scipy.stats.kendalltau(np.abs(score), values)
-        grows = "grows" if found.statistic > 0.0 else "falls"
-        yield Check(float(found.pvalue), remark(
-            f"{source_of(problem.table)}: the scatter {grows} with {word} (rank correlation "
-            f"{found.statistic:.2f}); one sigma is too wide at one end and too narrow at the "
-            f"other: {remedy}",
+        parts = [score[group == i] for i in range(levels.size)]
+        sd = np.array([part.std(ddof=1) for part in parts])
+        wide, tight = int(np.argmax(sd)), int(np.argmin(sd))
+        p = float(scipy.stats.levene(*parts).pvalue)
+        at = [column.words(levels[i]) for i in (wide, tight)]
+        # The values that are nearer to one of the two levels than to any other.
+        edges = [-np.inf, *(0.5 * (levels[1:] + levels[:-1])), np.inf]
+        near = tuple(Range(name, float(edges[i]), float(edges[i + 1])) for i in (wide, tight))
+        yield Check(p, remark(
+            "uneven", where=near, wide=at[0], tight=at[1], sd_wide=sd[wide], sd_tight=sd[tight],
+            p=plain_number(p, 2), **words,
         ))  # fmt: skip
 
 
-def _nearest(name: str, levels: Array, i: int) -> Range:
-    """Values of a condition that are nearer to one of its levels, in order, than to others."""
-    edges = [-np.inf, *(0.5 * (levels[1:] + levels[:-1])), np.inf]
-    return Range(name, float(edges[i]), float(edges[i + 1]))
-
-
-def _heavy_tailed(problem: Problem, residual: Array) -> Iterable[Check]:
-    """Anscombe and Glynn's (1983) test of the kurtosis, one-sided."""
-    if residual.size < _FEWEST_FOR_TAILS or problem.noise.student:
+def _heavy_tailed(problem: Problem, residual: Array) -> Iterator[Check]:
+    """Anscombe and Glynn's (1983) test of the kurtosis, one-sided, for which 20 rows suffice."""
+    if residual.size < 20 or problem.noise.student:
         return
     p = float(scipy.stats.kurtosistest(residual, alternative="greater").pvalue)
-    yield Check(p, Remark(
-        f"{source_of(problem.table)}: the residuals have heavier tails than normal noise "
-        f"(excess kurtosis {scipy.stats.kurtosis(residual):.1f}); single readings then weigh "
-        'too much: correct those that are wrong, or write family = "student_t" in the prior file',
-        "Heavy tails",
-    ))  # fmt: skip
+    kurtosis = scipy.stats.kurtosis(residual)
+    yield Check(p, remark("heavy", source=source_of(problem.table), kurtosis=kurtosis))
 
 
-# Probability of naming any row of data that are as the likelihood says.
-OUTLYING_LEVEL = 1e-3
-_STEP, _HUGE = 1e-5, 1e9
-# Rows taken out at most, and degrees of freedom below which nobody can say.
-_MOST, _LEAST_LEFT = 10, 2
-_LONG = 5000
-_MOST_NAMED = 5
-
-
-@dataclass(frozen=True)
-class OutlyingRow:
+class OutlyingRow(NamedTuple):
     """A row far off the others' calibration: its line in the file, and the output measured there.
 
     `sds` is its distance from what the other rows predict, in units of that distance's sd.
@@ -342,52 +329,53 @@ def outlying_rows(problem: Problem, t: Array) -> tuple[OutlyingRow, ...]:
     to the rest. Long data are not fitted again: in them one row hides nothing.
     """
     n = problem.response.size
-    most = 1 if n > _LONG else min(max(2, n // 10), _MOST)
-    used, suspects, here = np.ones(n, dtype=bool), 0, t
+    long = n > 5000
+    most = 1 if long else min(max(2, n // 10), 10)
+    used, suspects = np.ones(n, dtype=bool), 0
     order: list[int] = []
-    fits = [here]
+    fits = [t]
     while len(order) < most:
-        sds, left = _studentised(problem, here, used)
-        if left < _LEAST_LEFT:
+        sds, left = _studentised(problem, fits[-1], used)
+        if left < 2:
             break
         far = int(np.argmax(sds))
         order.append(far)
         if _probability(sds[far], int(used.sum()), left) < OUTLYING_LEVEL / most:
             suspects = len(order)
         used[far] = False
-        here = _fitted(problem, here, used) if n <= _LONG else here
-        fits.append(here)
+        fits.append(fits[-1] if long else _fitted(problem, fits[-1], used))
     if not suspects:
         return ()
     used = np.ones(n, dtype=bool)
     used[order[:suspects]] = False
-    sds, left = _from_the_rest(problem, fits[suspects], used)
+    # Distances from the fit to the rest, in sds of a new row's.
+    residual, design, rank = linear(problem, fits[suspects], used)
+    left = int(used.sum()) - rank
+    variance = max(float(np.sum(residual[used] ** 2)) / left, 1e-300)
+    sds = np.abs(residual) / np.sqrt(variance * (1.0 + np.sum(design**2, axis=1)))
     probability = _probability(sds, n, left)
-    found = np.flatnonzero((probability < OUTLYING_LEVEL) & (~used | (n > _LONG)))
     rows = [
         OutlyingRow(int(problem.table.lines[i]), float(problem.observed[i]), float(sds[i]))
-        for i in found
+        for i in np.flatnonzero((probability < OUTLYING_LEVEL) & (~used | long))
     ]
     return tuple(sorted(rows, key=lambda row: -row.sds))
 
 
-def outlying_notes(problem: Problem, t: Array) -> Sequence[str]:
-    """Say which rows are outlying, for a reader who may mend them."""
+def outlying_notes(problem: Problem, t: Array) -> list[str]:
+    """Say which rows are outlying, for a reader who may correct them."""
     rows = outlying_rows(problem, t)
-    # Not the path: the page goes to others.
     weight = "for one such row moves the posterior and widens it"
     if problem.noise.student:
         weight = "to which Student-t noise gives little weight"
-    source = PurePath(problem.table.source).name
+    source = source_of(problem.table)
     column = problem.table.column(problem.bound.model.output)
     said = [
         f"{source}, line {row.line}: {column.header} = "
         f"{plain_number(float(column.written(row.value)), 4)} is {row.sds:.1f} sds from what the "
         f"other rows say; check the reading, {weight}"
-        for row in rows[:_MOST_NAMED]
+        for row in rows[:5]
     ]
-    more = len(rows) - _MOST_NAMED
-    return [*said, f"{source}: so are {more} more"] if more > 0 else said
+    return said + [f"{source}: so are {len(rows) - 5} more"] * (len(rows) > 5)
 
 
 def _studentised(problem: Problem, t: Array, used: NDArray[np.bool_]) -> tuple[Array, int]:
@@ -401,38 +389,7 @@ def _studentised(problem: Problem, t: Array, used: NDArray[np.bool_]) -> tuple[A
     variance = np.maximum(np.sum(residual[used] ** 2) - residual**2 / alone, 0.0) / max(left, 1)
     with np.errstate(divide="ignore", invalid="ignore"):
         sds = np.abs(residual) / np.sqrt(variance * alone)
-    return np.where(judged, np.nan_to_num(sds, nan=0.0, posinf=_HUGE), 0.0), left
-
-
-def _from_the_rest(problem: Problem, t: Array, used: NDArray[np.bool_]) -> tuple[Array, int]:
-    """Distances from a fit to the rows used, in sds of a new row's, and degrees of freedom."""
-    residual, design, rank = linear(problem, t, used)
-    left = int(used.sum()) - rank
-    variance = max(float(np.sum(residual[used] ** 2)) / left, 1e-300)
-    return np.abs(residual) / np.sqrt(variance * (1.0 + np.sum(design**2, axis=1))), left
-
-
-def linear(problem: Problem, t: Array, used: NDArray[np.bool_]) -> tuple[Array, Array, int]:
-    """Residuals (n,), and the model made linear at a fit, orthonormal over the rows used.
-
-    Where the noise depends on a condition, over its scale there in units of sigma. The design is of
-    shape (n, rank), of directions that move predictions; the noise scale does not.
-    """
-    steps = _STEP * np.maximum(np.abs(t), 1.0)
-    moved = np.concatenate([t[None], t + np.diag(steps), t - np.diag(steps)])
-    natural = problem.theta(moved)
-    relative = problem.noise.scale(natural[:1], problem.conditions) / natural[0, -1]
-    residuals = problem.residuals(natural) / relative
-    d = t.size
-    # One-sided beside ground where the model has no value, as at the edge of an emulator.
-    ends = residuals[1:].reshape(2, d, -1)
-    there = np.isfinite(ends).all(axis=2)
-    ends = np.where(there[:, :, None], ends, residuals[0])
-    apart = np.maximum(there.sum(axis=0), 1) * steps
-    jacobian = ((ends[1] - ends[0]) / apart[:, None]).T
-    _, sizes, directions = np.linalg.svd(jacobian[used], full_matrices=False)
-    rank = int(np.sum(sizes > 1e-7 * max(float(sizes[0]), 1e-300)))
-    return residuals[0], jacobian @ directions[:rank].T / sizes[:rank], rank
+    return np.where(judged, np.nan_to_num(sds, nan=0.0, posinf=1e9), 0.0), left
 
 
 def _fitted(problem: Problem, t: Array, used: NDArray[np.bool_]) -> Array:

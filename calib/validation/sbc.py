@@ -40,11 +40,9 @@ from calib.inference.sampler import SamplerSettings
 from calib.models import MODELS, get_model
 from calib.models.base import Array
 from calib.models.simulators.declaration import slow_simulator
+from calib.validation.constants import LEVEL, LEVELS
 from calib.validation.replicate import Item, design_of, most_runs, replicate
-from calib.validation.scores import LEVELS
-
-_SIMULATIONS = 4000
-_JUMPS = 60  # a Poisson variable of mean one exceeds it with probability below 1e-80
+from calib.validation.scores import holm
 
 
 @dataclass(frozen=True)
@@ -71,7 +69,7 @@ def ecdf_band(values: Array, level: float) -> EcdfBand:
     ecdf_pit: Any = import_module("arviz_stats.ecdf_utils").ecdf_pit
 
     # The same random numbers every time: the band is a property of n and the level.
-    return EcdfBand(*ecdf_pit(values, level, _SIMULATIONS, rng=np.random.default_rng(1)))
+    return EcdfBand(*ecdf_pit(values, level, 4000, rng=np.random.default_rng(1)))
 
 
 def p_value(values: Array) -> float:
@@ -92,29 +90,14 @@ def _p_of_tail(n: int, tail: float) -> float:
     limit = tail * (1.0 + 1e-9)
     inside = (binom.cdf(k, n, z[:, None]) > limit) & (binom.sf(k - 1, n, z[:, None]) > limit)
     # Counts of n uniform values are those of a Poisson process of rate n, given n in all.
-    jump = poisson.pmf(np.arange(min(_JUMPS, n + 1)), 1.0)
+    # A Poisson variable of mean one exceeds 60 with probability below 1e-80.
+    jump = poisson.pmf(np.arange(min(60, n + 1)), 1.0)
     mass = np.zeros(n + 1)
     mass[0] = 1.0
     for allowed in np.asarray(inside):
         mass = np.convolve(mass, jump)[: n + 1] * allowed
     stays = np.convolve(mass, jump)[n] / poisson.pmf(n, n)
     return float(np.clip(1.0 - stays, 0.0, 1.0))
-
-
-def holm(p_values: Sequence[float]) -> list[float]:
-    """Adjust p values, in their order, for their number, family-wise (Holm 1979, JSTOR 4615733)."""
-    p = np.asarray(p_values, dtype=float)
-    order = np.argsort(p)
-    scaled = np.maximum.accumulate(p[order] * np.arange(p.size, 0, -1))
-    adjusted = np.empty_like(p)
-    adjusted[order] = np.minimum(scaled, 1.0)
-    return [float(v) for v in adjusted]
-
-
-# Chance of a false alarm in all quantities and bands of a run together.
-LEVEL = 0.05
-# Of a single rank there is no distribution.
-_FEWEST = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +159,7 @@ class ModelScore:
         Where it was measured, in words.
     unconverged, extended : int
         Posteriors that did not pass the gate even when extended, and all that were extended. The
-        former are left out of ranks and coverage, as a user is told not to use them: a choice
+        former are left out of ranks and coverage, as a user is warned not to use them: a choice
         made from data and chains alone, which keeps ranks uniform.
     attempts : int
         Draws from the prior that were needed.
@@ -257,10 +240,10 @@ def score_model(
     """Score the records of one model."""
     model, seed = records[0]["model"], records[0]["seed"]
     good = [r for r in records if r["converged"]]
-    if len(good) < _FEWEST:
+    if len(good) < 2:  # of a single rank there is no distribution
         raise CalibError(
             f"{len(good)} of {len(records)} posteriors of {model} converged: nothing can be told",
-            expected=f"{_FEWEST} or more that converged",
+            expected="2 or more that converged",
             hint="simulate more campaigns, or leave the model out; those that are done are kept",
         )
     names = dict.fromkeys(name for r in records for name in r["ranks"])
@@ -310,8 +293,6 @@ def _coverage(level: float, records: Sequence[Mapping[str, Any]]) -> BandCoverag
 # As for a report, but a chain is extended to 3200 steps, not 25,600, before it counts as one that
 # did not converge: simulated campaigns are many, and some tell next to nothing.
 SETTINGS = SamplerSettings(max_steps=3200)
-_RUN = "run.json"
-REPLICATES = "replicates"
 
 
 def run_sbc(
@@ -373,7 +354,7 @@ def run_sbc(
         for i in range(simulations)
     }  # fmt: skip
     outcome = run_tasks(
-        replicate, items, out / REPLICATES, **({} if slow else spread),
+        replicate, items, out / "replicates", **({} if slow else spread),
         progress=progress, announce=announce,
     )  # fmt: skip
     return score(read_records(out, outcome.done), seed, simulations, outcome.failed)
@@ -387,13 +368,13 @@ def chosen_models(models: Sequence[str] = ()) -> list[str]:
 
 def read_records(out: Path, names: Sequence[str]) -> list[dict[str, Any]]:
     """Return the records of some replicates of a run."""
-    return [json.loads((out / REPLICATES / f"{name}.json").read_bytes()) for name in names]
+    return [json.loads((out / "replicates" / f"{name}.json").read_bytes()) for name in names]
 
 
 def _claim(out: Path, run: dict[str, Any]) -> None:
     """Write what is run into the folder, or check that it is the same that is there."""
     check_room(out)
-    path = out / _RUN
+    path = out / "run.json"
     text = json.dumps(run, indent=1) + "\n"
     with writing(out):
         if path.exists():

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,15 +18,12 @@ from calib.inference.diagnostics import power_scaled_weights, power_sensitivity
 from calib.inference.problem import Problem
 from calib.inference.random import generator
 from calib.models.base import Array
-
-# Below, a posterior's sd is more than nine tenths of its prior's.
-CONTRACTION_MIN = 0.19
-# The threshold of Kallioinen et al.: above, a marginal reacts to the power.
-SENSITIVITY_MIN = 0.05
-_ALPHAS = (0.99, 1.01)
-_N_PRIOR = 20_000
-# Rows times vectors evaluated at once.
-_CELLS = 1_000_000
+from calib.validation.constants import (
+    CONTRACTION_MIN,
+    LEVELS,
+    RELATIVE_ERROR_FAR,
+    SENSITIVITY_MIN,
+)
 
 
 @dataclass(frozen=True)
@@ -74,68 +71,48 @@ def prior_sensitivity(calibration: Calibration) -> dict[str, Sensitivity]:
     chains = calibration.natural.shape[:2]
     log_prior = problem.priors.log_prob(draws.flat)
     parts = {"prior": log_prior, "likelihood": draws.log_prob.reshape(-1) - log_prior}
-    low, high = _ALPHAS
+    powers = (0.99, 1.01)
     weights = {
-        name: (power_scaled_weights(p, low), power_scaled_weights(p, high))
-        for name, p in ((name, part.reshape(chains)) for name, part in parts.items())
-    }
-    contraction = _contractions(calibration)
-    found = {}
-    for name, natural in calibration.parameters.items():
-        drawn = _scaled(calibration, name, natural)
-        reaction = {k: power_sensitivity(drawn, w, _ALPHAS) for k, w in weights.items()}
-        found[name] = Sensitivity(
-            name, reaction["prior"], reaction["likelihood"], contraction[name]
+        name: (
+            power_scaled_weights(part.reshape(chains), powers[0]),
+            power_scaled_weights(part.reshape(chains), powers[1]),
         )
-    return found
-
-
-def _scaled(calibration: Calibration, name: str, drawn: Array) -> Array:
-    free = {p.name: p for p in calibration.problem.priors.free}
-    log = free[name].log if name in free else bool((drawn > 0.0).all())
-    return np.log(drawn) if log else drawn
-
-
-def _contractions(calibration: Calibration) -> dict[str, float]:
-    prior = _prior_draws(calibration)
-    return {
-        name: 1.0 - calibration.summary[name].sd_ratio ** 2
-        if name in calibration.problem.names
-        else _score_contraction(prior[name], drawn.reshape(-1))
-        for name, drawn in calibration.parameters.items()
+        for name, part in parts.items()
     }
+    logged = {p.name: p.log for p in problem.priors.free}
+    prior = _prior_draws(calibration)
+    found = {}
+    for name, drawn in calibration.parameters.items():
+        scaled = np.log(drawn) if logged.get(name, (drawn > 0.0).all()) else drawn
+        reaction = {k: power_sensitivity(scaled, w, powers) for k, w in weights.items()}
+        contraction = (
+            1.0 - calibration.summary[name].sd_ratio ** 2
+            if name in problem.names
+            else _score_contraction(prior[name], drawn.reshape(-1))
+        )
+        found[name] = Sensitivity(name, reaction["prior"], reaction["likelihood"], contraction)
+    return found
 
 
 def _prior_draws(calibration: Calibration) -> Mapping[str, Array]:
     """Published parameters of prior draws at which the model has a value at every row."""
     problem = calibration.problem
     rng = generator(calibration.seed, calibration.label, "sensitivity")
-    natural = problem.theta(problem.priors.sample(rng, _N_PRIOR))
-    at_once = max(1, _CELLS // len(problem.table))
+    theta = problem.of_model(problem.theta(problem.priors.sample(rng, 20_000)))
+    # A million values at once.
+    parts = np.array_split(theta, 1 + len(theta) * len(problem.table) // 1_000_000)
     defined = [
-        np.isfinite(
-            problem.bound.mean_response(
-                problem.of_model(natural[i : i + at_once]), problem.conditions
-            )
-        )
-        for i in range(0, _N_PRIOR, at_once)
+        np.isfinite(problem.bound.mean_response(part, problem.conditions)).all(axis=1)
+        for part in parts
     ]
-    natural = natural[np.concatenate([part.all(axis=1) for part in defined])]
     with np.errstate(all="ignore"):
-        return problem.bound.report(problem.of_model(natural))
+        return problem.bound.report(theta[np.concatenate(defined)])
 
 
 def _score_contraction(prior: Array, posterior: Array) -> float:
     ordered = np.sort(prior[~np.isnan(prior)])
     below = np.searchsorted(ordered, posterior) + 0.5
     return 1.0 - float(np.var(ndtri(below / (ordered.size + 1.0))))
-
-
-LEVELS = (0.5, 0.9, 0.95)
-# Relative errors of a pull near zero say nothing: rows below this part of the largest are left out.
-RELATIVE_ERROR_FLOOR = 0.05
-# Rows that are farther off than this are counted.
-RELATIVE_ERROR_FAR = 0.06
 
 
 @dataclass(frozen=True)
@@ -228,10 +205,21 @@ def jeffreys(hits: int, n: int) -> tuple[float, float]:
     return low, 1.0 if hits == n else float(betaincinv(a, b, 0.975))
 
 
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Adjust p values, in their order, for their number, family-wise (Holm 1979, JSTOR 4615733)."""
+    p = np.asarray(p_values, dtype=float)
+    order = np.argsort(p)
+    scaled = np.maximum.accumulate(p[order] * np.arange(p.size, 0, -1))
+    adjusted = np.empty_like(p)
+    adjusted[order] = np.minimum(scaled, 1.0)
+    return [float(v) for v in adjusted]
+
+
 def score(draws: Array, observed: Array, *, heavy: bool = False) -> Scores:
     """Score predictive draws (n_draws, n) of observations (n,); heavy ones have no CRPS."""
     median = np.median(draws, axis=0)
-    large = np.abs(observed) > RELATIVE_ERROR_FLOOR * np.abs(observed).max()
+    # Relative errors of a pull near zero say nothing.
+    large = np.abs(observed) > 0.05 * np.abs(observed).max()
     relative = np.full(observed.size, np.nan)
     relative[large] = (median[large] - observed[large]) / observed[large]
     return Scores(
@@ -243,9 +231,6 @@ def score(draws: Array, observed: Array, *, heavy: bool = False) -> Scores:
         pit=pit(draws, observed),
         median=median,
     )
-
-
-_N_DRAWS = 1000
 
 
 @dataclass(frozen=True)
@@ -262,7 +247,7 @@ class Standardised:
 
 def standardise(calibration: Calibration, problem: Problem) -> Standardised:
     """Work residuals out at the posterior: of the problem's rows, calibrated on or others."""
-    natural = problem.theta(calibration.subset(_N_DRAWS))
+    natural = problem.theta(calibration.subset(1000))
     location = problem.bound.mean_response(problem.of_model(natural), problem.conditions)
     residual = np.nanmean(
         problem.noise.normal_scores(problem.response - location, natural, problem.conditions),
@@ -298,8 +283,7 @@ MOVED, PRIOR = "moved, not narrowed", "set by the prior"
 ROLES = (DATA, BOTH, MOVED, PRIOR)
 
 # The same limit as that of an identified parameter: nine tenths of the prior's sd.
-PRIOR_SET, PARTLY_SET = (1.0 - CONTRACTION_MIN) ** 0.5, 0.5
-MOVED_SDS = 0.5
+PRIOR_SET = (1.0 - CONTRACTION_MIN) ** 0.5
 
 
 def role_of(sd_ratio: float, moved: float) -> str:
@@ -310,8 +294,8 @@ def role_of(sd_ratio: float, moved: float) -> str:
     if np.isnan(sd_ratio):
         return ""
     if sd_ratio > PRIOR_SET:
-        return MOVED if moved > MOVED_SDS else PRIOR
-    return BOTH if sd_ratio > PARTLY_SET else DATA
+        return MOVED if moved > 0.5 else PRIOR
+    return BOTH if sd_ratio > 0.5 else DATA
 
 
 def shift(calibration: Calibration, name: str) -> float:

@@ -23,11 +23,9 @@ from calib.inference.problem import Problem
 from calib.inference.random import generator, stream
 from calib.inference.sampler import Progress, SamplerSettings, sample_posterior
 from calib.models.base import Array
-from calib.validation.prediction import N_DRAWS, predictive_draws
-from calib.validation.scores import LEVELS, RELATIVE_ERROR_FAR, Scores, crps, score
-
-# Above this, importance sampling cannot be trusted to leave a row out (Vehtari et al. 2024).
-PARETO_K_MAX = 0.7
+from calib.validation.constants import LEVELS, N_DRAWS, PARETO_K_MAX, RELATIVE_ERROR_FAR
+from calib.validation.prediction import predictive_draws
+from calib.validation.scores import Scores, crps, score
 
 
 @dataclass(frozen=True)
@@ -169,17 +167,11 @@ def leave_one_out(
     )  # fmt: skip
 
 
-# A problem without one of its rows, the seed, the mode with it, and how to sample.
-type _Left = tuple[Problem, np.random.SeedSequence, Array, SamplerSettings | None]
-# Draws without one row, shape (N_DRAWS, d), and whether they passed the gate.
-type _Refit = tuple[Array, bool]
-
-
 def _refits(
     calibration: Calibration, rows: Sequence[int], settings: SamplerSettings | None,
     progress: Progress | None, workers: int,
-) -> dict[int, _Refit]:  # fmt: skip
-    """Fit again without each of some rows."""
+) -> dict[int, tuple[Array, bool]]:  # fmt: skip
+    """Fit again without each of some rows: draws (N_DRAWS, d), and whether they pass the gate."""
     problem, n = calibration.problem, calibration.problem.response.size
     left = {
         str(i): (
@@ -202,7 +194,9 @@ def _refits(
     return {i: found[i] for i in rows}
 
 
-def _refit(left: _Left) -> _Refit:
+def _refit(
+    left: tuple[Problem, np.random.SeedSequence, Array, SamplerSettings | None],
+) -> tuple[Array, bool]:
     problem, seed, mode, settings = left
     again = sample_posterior(problem, seed, starts=mode[None], settings=settings)
     picked = np.linspace(0, again.flat.shape[0] - 1, N_DRAWS).astype(int)
@@ -218,16 +212,6 @@ type Place = tuple[str, ...]
 type Errors = dict[Place, float | None]
 """By path; None where a tail is too heavy for one."""
 
-# Shapes with which the variance of a mean exists, and of a variance: a little less, as estimated.
-_K_MEAN, _K_SD = 0.5, 0.2
-# Of an interval's width: an end at the edge of what is possible hangs on the few outermost draws.
-# Between seeds k of the rut depth's moves so far.
-_END = 2e-4
-# Of random draws, among which scores scatter; their sd is known to a twentieth.
-_GROUPS = 200
-# Draws of the round of importance sampling that estimates the evidence, at least.
-_EVIDENCE_DRAWS = 1500
-
 
 def posterior_errors(calibration: Calibration) -> Errors:
     """Return the Monte Carlo standard errors of a posterior summary, by paths below the output."""
@@ -237,10 +221,12 @@ def posterior_errors(calibration: Calibration) -> Errors:
     errors: Errors = {}
     for j, name in enumerate(names):
         stated = calibration.summary[name]
-        least = _END * (stated.hdi_upper - stated.hdi_lower)
+        # An end at the edge of what is possible depends on the few outermost draws.
+        least = 2e-4 * (stated.hdi_upper - stated.hdi_lower)
+        # Pareto shapes with which the variance of a mean exists, and of a variance: a little less.
         errors |= {
-            ("posterior", name, "mean"): stated.mcse_mean if shape[j] < _K_MEAN else None,
-            ("posterior", name, "sd"): float(sd[j]) if shape[j] < _K_SD else None,
+            ("posterior", name, "mean"): stated.mcse_mean if shape[j] < 0.5 else None,
+            ("posterior", name, "sd"): float(sd[j]) if shape[j] < 0.2 else None,
             ("posterior", name, "median"): stated.mcse_median,
             ("posterior", name, "hdi_lower"): max(stated.mcse_hdi_lower, least),
             ("posterior", name, "hdi_upper"): max(stated.mcse_hdi_upper, least),
@@ -253,7 +239,8 @@ def posterior_errors(calibration: Calibration) -> Errors:
         if np.isfinite(ratio):
             errors["posterior", name, "posterior_to_prior_sd"] = ratio * float(relative[j])
     efficiency = max(draws.efficiency, 1e-3)
-    errors["sampling", "log_evidence"] = float(np.sqrt((1.0 / efficiency - 1.0) / _EVIDENCE_DRAWS))
+    # The evidence is estimated from at least 1500 draws of importance sampling.
+    errors["sampling", "log_evidence"] = float(np.sqrt((1.0 / efficiency - 1.0) / 1500))
     return errors
 
 
@@ -271,7 +258,8 @@ def validation_errors(
     part = float(np.sqrt(1.0 / n_draws + 1.0 / least_ess(calibration)))
     p = np.clip(scores.pit, 4.0 / n_draws, 1.0 - 4.0 / n_draws)
     pit = np.sqrt(p * (1.0 - p)) * part
-    size = max(n_draws // _GROUPS, 1)
+    # 200 groups of random draws: the sd of scores among them is known to a twentieth.
+    size = max(n_draws // 200, 1)
     groups = generator(0, "groups of draws").permutation(draws)[: n_draws - n_draws % size]
     groups = groups.reshape(-1, size, n)
     of_group = part * float(np.sqrt(size))

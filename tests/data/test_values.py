@@ -11,7 +11,7 @@ import numpy as np
 import pint
 import pytest
 
-from calib.data.files import real_array
+from calib.data.quantities import real_array
 from calib.errors import CalibError
 
 UNITS = pint.UnitRegistry()

@@ -21,8 +21,9 @@ from calib.report.verdict import (
     gather,
     judge_evidence,
 )
+from calib.validation.constants import LEVEL
 from calib.validation.prediction import binomial_p
-from calib.validation.residuals import LEVEL, Check, Range, Remark
+from calib.validation.residuals import Check, Range, Remark
 
 FINE = Evidence(
     converged=True,

@@ -11,15 +11,20 @@ from scipy import stats
 from calib.data import Table, table_from_arrays
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration
+from calib.validation.constants import LEVELS
 from calib.validation.prediction import (
     bands,
+    binomial_p,
+    coverage_probability,
+    effective_rows,
+    ks_distance,
     median_change,
+    pit_half_width,
     predict,
     prediction_columns,
     predictive_draws,
     smooth_bands,
 )
-from calib.validation.scores import LEVELS
 from calib.validation.validate import leave_one_out
 
 
@@ -36,25 +41,10 @@ def test_bands_are_quantiles() -> None:
     for level in LEVELS:
         np.testing.assert_allclose(found.lower[level], np.quantile(draws, 0.5 - level / 2, axis=0))
         np.testing.assert_allclose(found.upper[level], np.quantile(draws, 0.5 + level / 2, axis=0))
-
-
-def test_vectors_without_a_value_are_left_out_of_the_bands() -> None:
-    draws = np.random.default_rng(1).standard_normal((500, 2))
-    holed = np.vstack([draws, np.full((100, 2), np.nan)])
-    np.testing.assert_allclose(bands(holed).upper[0.9], bands(draws).upper[0.9])
-
-
-def test_parameter_bands_are_those_of_the_model_over_the_draws(
-    pull_calibration: Calibration,
-) -> None:
-    table = conditions([0.02, 0.1, 0.3])
-    found = predict(pull_calibration, table)
-    problem = pull_calibration.problem
-    natural = problem.theta(pull_calibration.subset(4000))
-    curve = problem.bound.predict(natural[:, :-1], table.columns)
-    np.testing.assert_allclose(found.parameter.median, np.median(curve, axis=0))
-    np.testing.assert_allclose(found.parameter.upper[0.95], np.quantile(curve, 0.975, axis=0))
-    assert found.output == "drawbar_pull_kn"
+    # Vectors without a value are left out; where none has one, neither have the bands.
+    holed = np.vstack([draws, np.full((100, 4), np.nan)])
+    np.testing.assert_allclose(bands(holed).upper[0.9], found.upper[0.9])
+    assert np.isnan(bands(np.full((10, 2), np.nan)).median).all()
 
 
 def emulated(calibration: Calibration, sd: float) -> Calibration:
@@ -114,6 +104,11 @@ def test_predictive_bands_add_the_noise(pull_calibration: Calibration) -> None:
     natural = pull_calibration.problem.theta(pull_calibration.subset(4000))
     curve = pull_calibration.problem.bound.predict(natural[:, :-1], table.columns)
     sigma = natural[:, -1:]
+    np.testing.assert_allclose(found.parameter.median, np.median(curve, axis=0))
+    np.testing.assert_allclose(found.parameter.upper[0.95], np.quantile(curve, 0.975, axis=0))
+    assert found.output == "drawbar_pull_kn"
+    again = predict(pull_calibration, table)
+    np.testing.assert_array_equal(again.predictive.upper[0.9], found.predictive.upper[0.9])
     for level in LEVELS:
         # The part of each draw's normal below the band's edge, averaged, is the band's level.
         below = stats.norm.cdf(found.predictive.upper[level], curve, sigma).mean(axis=0)
@@ -131,12 +126,6 @@ def test_ruts_are_predicted_in_millimetres(rut_calibration: Calibration) -> None
     found = predict(rut_calibration, table)
     assert 10.0 < found.predictive.lower[0.95][0] < found.parameter.median[0] < 60.0
     assert found.parameter.median[0] < found.predictive.upper[0.95][0] < 100.0
-
-
-def test_the_same_prediction_twice(pull_calibration: Calibration) -> None:
-    table = conditions([0.1, 0.2])
-    one, other = predict(pull_calibration, table), predict(pull_calibration, table)
-    np.testing.assert_array_equal(one.predictive.upper[0.9], other.predictive.upper[0.9])
 
 
 def test_draws_come_in_the_order_of_mean_and_measurement(rut_calibration: Calibration) -> None:
@@ -163,16 +152,6 @@ def test_leaving_the_calibrated_range_is_flagged(pull_calibration: Calibration) 
     assert both.outside == (("slip_ratio", "inflation_pressure_psi"),)
 
 
-def test_where_no_vector_has_a_value_neither_have_the_bands(
-    pull_calibration: Calibration,
-) -> None:
-    """Two columns of NaN say nothing; they must not warn either."""
-    found = bands(np.full((10, 2), np.nan))
-    assert np.isnan(found.median).all()
-    far = predict(pull_calibration, conditions([0.1], psi=400.0))
-    assert far.outside == (("inflation_pressure_psi",),)
-
-
 def test_a_missing_condition_is_told(pull_calibration: Calibration) -> None:
     table = table_from_arrays({"slip_ratio": np.array([0.1])})
     with pytest.raises(CalibError, match="needs inflation_pressure_psi"):
@@ -194,13 +173,6 @@ def test_a_prediction_as_columns(pull_calibration: Calibration) -> None:
         columns["drawbar_pull_kn_parameter_50_lower"], found.parameter.lower[0.5]
     )
     assert columns["outside_calibrated_range"] == ["", "slip_ratio"]
-
-
-def test_bands_of_a_row_do_not_depend_on_the_other_rows(pull_calibration: Calibration) -> None:
-    many = predict(pull_calibration, conditions(np.array([0.05, 0.2, 0.5])))
-    one = predict(pull_calibration, conditions(np.array([0.2])))
-    assert one.predictive.lower[0.9][0] == many.predictive.lower[0.9][1]
-    assert one.predictive.upper[0.95][0] == many.predictive.upper[0.95][1]
 
 
 def test_no_band_where_the_model_has_no_value_for_much_of_the_posterior(
@@ -241,3 +213,59 @@ def test_the_median_changes_as_the_equation_does(rut_calibration: Calibration) -
     low, high = np.median(problem.bound.predict(natural[:, :-1], at), axis=0)
     assert median_change(rut_calibration, "slip_ratio") == pytest.approx(high - low, rel=0.02)
     assert median_change(rut_calibration, "average_ground_pressure_kpa") > 0.0
+
+
+# References for rows that are not independent
+
+
+@pytest.fixture
+def independent() -> np.ndarray:
+    return np.random.default_rng(1).standard_normal((4000, 12))
+
+
+@pytest.fixture
+def shared() -> np.ndarray:
+    """Rows that move as one."""
+    rng = np.random.default_rng(2)
+    return rng.standard_normal((4000, 1)) + 0.01 * rng.standard_normal((4000, 12))
+
+
+def test_independent_rows_give_the_kolmogorov_law(independent):
+    assert pit_half_width(independent) == pytest.approx(stats.kstwo.ppf(0.95, 12), rel=0.04)
+
+
+def test_independent_rows_give_the_binomial_law(independent):
+    found = coverage_probability(independent, 9, 0.9)
+    assert found == pytest.approx(stats.binom.cdf(9, 12, 0.9), abs=0.02)
+
+
+def test_rows_that_move_as_one_miss_as_one(shared):
+    # All twelve outside happens one time in ten, where the binomial law says 1e-12.
+    assert coverage_probability(shared, 0, 0.9) == pytest.approx(0.1, abs=0.02)
+    assert pit_half_width(shared) > 0.9
+
+
+def test_effective_rows(independent, shared):
+    assert effective_rows(independent) == pytest.approx(12, abs=0.6)
+    assert effective_rows(shared) == pytest.approx(1, abs=0.01)
+    assert effective_rows(shared[:, :1]) == 1
+
+
+def test_draws_without_a_value_are_left_out(independent):
+    holed = independent.copy()
+    holed[::50, 3] = np.nan
+    assert coverage_probability(holed, 12, 0.9) == pytest.approx(1.0)
+    assert np.isfinite(effective_rows(holed))
+
+
+def test_ks_distance_of_known_values():
+    assert ks_distance(np.array([0.5])) == pytest.approx(0.5)
+    assert ks_distance(np.array([0.25, 0.75])) == pytest.approx(0.25)
+    assert ks_distance(np.array([[0.9, 0.95], [0.25, 0.75]])) == pytest.approx([0.9, 0.25])
+
+
+def test_binomial_p():
+    assert binomial_p(14, 14) == pytest.approx(1.0)
+    assert binomial_p(9, 14) == pytest.approx(0.0092, abs=0.0005)
+    assert binomial_p(9, 14, 0.5) == pytest.approx(stats.binom.cdf(9, 14, 0.5), rel=1e-12)
+    assert np.isnan(binomial_p(0, 0))

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from calib.data import Table
-from calib.data.files import real_array
-from calib.data.reader import open_csv
+from calib.data.files import open_csv
+from calib.data.quantities import real_array
 from calib.data.table import parse_header
 from calib.errors import CalibError
 from calib.inference.design import check_moves, check_scale

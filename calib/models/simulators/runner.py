@@ -35,7 +35,8 @@ import psutil
 
 from calib.batch.folders import check_room
 from calib.batch.user_code import USER_MODULE, call, content_of, declared_in, fingerprint
-from calib.data.files import decoded, read_text, real_array
+from calib.data.files import decoded, read_text
+from calib.data.quantities import real_array
 from calib.errors import CalibError
 from calib.models.base import Array
 from calib.models.constants import END_BYTES, KILL_SECONDS

@@ -20,8 +20,8 @@ import numpy as np
 
 from calib.batch.folders import writing
 from calib.batch.tasks import read_seconds, run_tasks
-from calib.data.files import plain_number, real_array
-from calib.data.quantities import QUANTITIES, convert
+from calib.data.files import plain_number
+from calib.data.quantities import QUANTITIES, convert, real_array
 from calib.data.table import parse_header
 from calib.errors import CalibError
 from calib.models.base import Array

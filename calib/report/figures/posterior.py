@@ -42,7 +42,7 @@ from calib.report.labels import NO_UNIT, joined, parameter_label, plain, short, 
 from calib.report.numbers import TIMES
 from calib.report.reference import NOTHING, Reference
 from calib.report.study import OutputResult
-from calib.validation.assumptions import FAR_SDS
+from calib.validation.constants import FAR_SDS
 from calib.validation.scores import MOVED, PRIOR, ROLES, role
 
 MAX_PARAMETERS = 11

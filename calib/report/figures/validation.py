@@ -36,13 +36,9 @@ from calib.report.rows import (
     x_column,
 )
 from calib.report.study import OutputResult
+from calib.validation.constants import PARETO_K_MAX
 from calib.validation.prediction import effective_rows, ks_distance, pit_half_width
-from calib.validation.scores import (
-    Standardised,
-    normal_order,
-    standardise,
-)
-from calib.validation.validate import PARETO_K_MAX
+from calib.validation.scores import Standardised, normal_order, standardise
 
 
 def residuals_plate(result: OutputResult) -> Plate:

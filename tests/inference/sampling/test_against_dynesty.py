@@ -16,7 +16,7 @@ from calib.inference.problem import Problem, build_problem
 from calib.inference.sampler import sample_posterior
 from calib.models import MODELS
 from calib.validation.replicate import design_of
-from calib.validation.sbc import holm
+from calib.validation.scores import holm
 
 RUNS, LIVE = 10, 150
 QUANTILES = (0.05, 0.5, 0.95)

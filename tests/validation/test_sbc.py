@@ -1,0 +1,361 @@
+"""Simulation-based calibration: ranks, p values, coverage, power, and runs in a folder."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+from typer.testing import CliRunner
+
+from calib.cli.app import app
+from calib.errors import CalibError
+from calib.inference.diagnostics import Gate
+from calib.inference.prior_files import default_priors
+from calib.inference.sampler import SamplerSettings
+from calib.report.sbc import text_table, verdict
+from calib.validation.sbc import _coverage, ecdf_band, p_value, pit, run_sbc
+from calib.validation.sbc import score as score_of
+from calib.validation.scores import holm
+from tests.browser import Browser, faults
+
+
+def statistic(values: np.ndarray) -> float:
+    """The smallest pointwise tail, written out."""
+    n = values.size
+    tails = []
+    for i in range(1, n):
+        k = int((values <= i / n).sum())
+        law = stats.binom(n, i / n)
+        tails += [law.cdf(k), law.sf(k - 1)]
+    return min(tails)
+
+
+def p_by_transitions(n: int, tail: float) -> float:
+    """An independent way: counts are a Markov chain with binomial steps."""
+    mass = {0: 1.0}
+    for i in range(1, n):
+        z, before = i / n, (i - 1) / n
+        law, new = stats.binom(n, z), {}
+        for k, m in mass.items():
+            step = stats.binom(n - k, (z - before) / (1.0 - before))
+            for j in range(n - k + 1):
+                if min(law.cdf(k + j), law.sf(k + j - 1)) > tail * (1.0 + 1e-9):
+                    new[k + j] = new.get(k + j, 0.0) + m * step.pmf(j)
+        mass = new
+    return 1.0 - sum(mass.values())
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_p_value_is_that_of_a_slow_and_plain_recursion(seed: int) -> None:
+    values = np.random.default_rng(seed).uniform(size=12) ** (1.0 + 0.5 * seed)
+    expected = p_by_transitions(12, statistic(values))
+    assert p_value(values) == pytest.approx(expected, rel=1e-8, abs=1e-12)
+
+
+def test_p_values_of_uniform_samples_are_uniform() -> None:
+    rng = np.random.default_rng(2)
+    found = np.array([p_value(rng.uniform(size=60)) for _ in range(2000)])
+    for level in (0.01, 0.05, 0.2, 0.5):
+        # They are discrete: P(p <= level) may fall short of the level a little, never exceed it.
+        hits = int((found <= level).sum())
+        assert stats.binomtest(hits, 2000, level, alternative="greater").pvalue > 1e-3
+        assert hits > 0.7 * 2000 * level
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), n=st.integers(2, 80), power=st.floats(0.2, 5.0))
+def test_a_p_value_is_a_probability_whatever_the_side(seed: int, n: int, power: float) -> None:
+    values = np.random.default_rng(seed).uniform(size=n) ** power
+    assert 0.0 <= p_value(values) <= 1.0
+    assert p_value(1.0 - values) == pytest.approx(p_value(values), rel=1e-6, abs=1e-9)
+
+
+@pytest.mark.parametrize("shape", [(0.5, 0.5), (2.0, 2.0), (1.5, 1.0), (1.0, 1.5)])
+def test_what_is_not_uniform_is_found(shape: tuple[float, float]) -> None:
+    """Too narrow, too wide, biased up, biased down."""
+    assert p_value(stats.beta(*shape).rvs(300, random_state=1)) < 1e-4
+
+
+@pytest.mark.parametrize("n", [40, pytest.param(300, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("level", [0.9, 0.95])
+def test_arviz_bands_hold_the_whole_curve_as_often_as_they_say(n: int, level: float) -> None:
+    rng = np.random.default_rng(3)
+    band = ecdf_band(rng.uniform(size=n), level)
+    assert band.x[0] == band.ecdf[0] == 0.0
+    assert band.x[-1] == band.ecdf[-1] == 1.0
+    x = band.x[1:-1]
+    samples = np.sort(rng.uniform(size=(2000, n)), axis=1)
+    inside = 0
+    for sample in samples:
+        ecdf = np.searchsorted(sample, x, side="right") / n
+        inside += bool(((ecdf >= band.lower[1:-1]) & (ecdf <= band.upper[1:-1])).all())
+    # The band is simulated itself, from 4000 samples: a standard error of its own.
+    error = np.sqrt(level * (1.0 - level) * (1.0 / 2000 + 1.0 / 4000))
+    assert abs(inside / 2000 - level) < 5.0 * error
+
+
+def test_ranks_are_spread_over_their_share() -> None:
+    ranks = [[0, 3], [3, 3], [1, 3]]
+    drawn = np.array([pit(ranks, np.random.default_rng(s)) for s in range(400)])
+    low, high = drawn.min(axis=0), drawn.max(axis=0)
+    np.testing.assert_allclose(low, [0.0, 0.75, 0.25], atol=0.01)
+    np.testing.assert_allclose(high, [0.25, 1.0, 0.5], atol=0.01)
+
+
+def test_holm() -> None:
+    # The smallest is multiplied by all, the next by all but one, and order is kept.
+    assert holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
+    assert holm([0.5, 0.9]) == pytest.approx([1.0, 1.0])
+
+
+SIMULATIONS, DRAWS, ROWS, EXPERIMENTS = 300, 400, 5, 10
+
+
+def least_p(rng: np.random.Generator, *, scale: float, shift: float) -> float:
+    """Adjusted p value of a run whose posterior is wrong by a factor of its sd and a shift.
+
+    A level theta ~ N(0, 1) seen in `ROWS` readings of unit noise; the posterior is normal.
+    """
+    theta = rng.standard_normal((SIMULATIONS, 1))
+    y = theta + rng.standard_normal((SIMULATIONS, ROWS))
+    sd = (1.0 + ROWS) ** -0.5
+    mean = y.sum(axis=1, keepdims=True) * sd**2
+    drawn = mean + sd * (shift + scale * rng.standard_normal((SIMULATIONS, DRAWS)))
+
+    def log_likelihood(level: np.ndarray) -> np.ndarray:
+        return -0.5 * np.square(y[:, :, None] - level[:, None]).sum(axis=1)
+
+    quantities = {
+        "theta": (drawn, theta),
+        "log_likelihood": (log_likelihood(drawn), log_likelihood(theta)),
+        "reading": (
+            drawn + rng.standard_normal(drawn.shape), theta + rng.standard_normal(theta.shape)
+        ),
+    }  # fmt: skip
+    p = [
+        p_value(pit([[int(b), DRAWS] for b in (d < t).sum(axis=1)], rng))
+        for d, t in quantities.values()
+    ]
+    return min(holm(p))
+
+
+@pytest.mark.parametrize(
+    ("scale", "shift", "found"),
+    [
+        (0.8, 0.0, True),
+        pytest.param(1.25, 0.0, True, marks=pytest.mark.slow),
+        (1.0, 0.3, True),
+        (1.0, 0.0, False),
+    ],
+)
+def test_wrong_posteriors_are_found_and_right_ones_pass(
+    scale: float, shift: float, found: bool
+) -> None:
+    rng = np.random.default_rng(6)
+    alarms = sum(least_p(rng, scale=scale, shift=shift) < 0.05 for _ in range(EXPERIMENTS))
+    if found:
+        assert alarms >= 0.9 * EXPERIMENTS
+    else:
+        # A twentieth by chance: five of ten would happen once in sixteen thousand times.
+        assert alarms < 5
+
+
+def covered_records(covered: np.ndarray, rows: int) -> list[dict]:
+    return [{"rows": rows, "covered": {"95": int(c)}} for c in covered]
+
+
+def test_few_campaigns_that_all_cover_are_no_alarm():
+    """Between ten campaigns of which nine cover wholly there is hardly any spread to see."""
+    found = _coverage(0.95, covered_records(np.array([9] * 9 + [8]), 9))
+    assert found.se == pytest.approx(np.sqrt(0.95 * 0.05 / 90))
+    assert found.p > 0.05
+
+
+def test_rows_that_share_a_posterior_widen_the_error():
+    """Campaigns that cover all or nothing have the spread of campaigns, not of rows."""
+    covered = np.array([9] * 38 + [0] * 2)
+    found = _coverage(0.95, covered_records(covered, 9))
+    assert found.se == pytest.approx((covered / 9).std(ddof=1) / np.sqrt(40))
+    assert found.p == pytest.approx(1.0)
+
+
+def test_right_bands_raise_alarms_as_often_as_they_should():
+    """Of independent rows: p below 0.05 in a twentieth of the runs, and never much more."""
+    rng = np.random.default_rng(3)
+    runs = [_coverage(0.95, covered_records(rng.binomial(9, 0.95, n), 9)) for n in (10, 300) * 200]
+    for few in (0, 1):
+        share = np.mean([run.p < 0.05 for run in runs[few::2]])
+        assert share < 0.05 + 4.0 * np.sqrt(0.05 * 0.95 / 200)
+
+
+def test_without_rows_there_is_nothing_to_judge():
+    found = _coverage(0.95, covered_records(np.zeros(3, dtype=int), 0))
+    assert np.isnan(found.proportion)
+    assert found.p == 1.0
+
+
+def test_a_run_of_which_all_failed_says_why():
+    with pytest.raises(CalibError, match="could be calibrated: no disk"):
+        score_of([], 1, 10, {"bekker-0000": "no disk"})
+
+
+NAMES = ("bekker", "modified_bekker")
+QUICK = SamplerSettings(steps=100, max_steps=400)
+# Where it does not matter how well replicates converge.
+SHORT = SamplerSettings(steps=40, max_steps=40, gate=Gate(rhat_max=10.0, ess_min=0.0, taus_min=0.0))
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("sbc") / "run"
+    result = CliRunner().invoke(
+        app,
+        ["sbc", "--out", str(folder), "--model", "bekker", "--simulations", "5", "--seed", "3",
+         "--workers", "1"],
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    assert "No miscalibration found" in result.output
+    return folder
+
+
+def test_the_command_leaves_numbers_figures_and_a_page(out: Path) -> None:
+    assert {p.name for p in out.iterdir()} == {
+        "run.json", "replicates", "sbc.json", "figures", "index.html",
+    }  # fmt: skip
+    assert {p.name for p in (out / "figures").iterdir()} == {"bekker.png", "coverage.png"}
+    found = json.loads((out / "sbc.json").read_text())
+    assert found["seed"] == 3
+    assert found["alarms"] == []
+    model = found["models"]["bekker"]
+    assert model["replicates"] == 5
+    assert set(model["coverage"]) == {"50", "90", "95"}
+    for quantity in model["quantities"].values():
+        assert len(quantity["pit"]) == 5
+        assert quantity["p"] <= quantity["p_adjusted"]
+
+
+def test_the_page_makes_no_request_and_has_its_figures_inside(out: Path) -> None:
+    html = (out / "index.html").read_text()
+    assert not re.search(r"https?://|@import|url\(", html)
+    assert html.count('src="data:image/png;base64,') == 2
+    assert "calib" in html
+
+
+def test_the_page_holds_in_a_browser(out: Path, browser: Browser) -> None:
+    assert faults(browser, out / "index.html") == []
+
+
+def test_a_run_is_resumed_and_extended(out: Path, tmp_path: Path) -> None:
+    first = run_sbc(tmp_path / "run", models=NAMES, simulations=2, seed=1, settings=SHORT)
+    files = sorted((tmp_path / "run" / "replicates").glob("*-*.json"))
+    assert len(files) == 4
+    before = {f: (f.read_bytes(), f.stat().st_mtime_ns) for f in files}
+    files[2].unlink()
+    more = run_sbc(tmp_path / "run", models=NAMES, simulations=3, seed=1, settings=SHORT)
+    assert [m.replicates for m in first.models] == [2, 2]
+    assert [m.replicates for m in more.models] == [3, 3]
+    for path, (content, changed) in before.items():
+        assert path.read_bytes() == content
+        assert (path.stat().st_mtime_ns == changed) == (path != files[2])
+
+
+@pytest.mark.slow
+def test_two_processes_give_what_one_gives(tmp_path: Path) -> None:
+    for workers in (1, 2):
+        run_sbc(
+            tmp_path / str(workers), models=NAMES[:1], simulations=4, seed=2, settings=QUICK,
+            workers=workers,
+        )  # fmt: skip
+    one, two = (
+        {p.name: p.read_bytes() for p in (tmp_path / w / "replicates").glob("*-*.json")}
+        for w in "12"
+    )
+    assert len(one) == 4
+    assert one == two
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda folder: {"seed": 4, "simulations": 5}, "another seed"),
+        (lambda folder: {"models": ("no_such",)}, "there is no model"),
+    ],
+)
+def test_what_does_not_fit_is_refused(out: Path, spoil, message: str) -> None:
+    arguments = {"models": ("bekker",), "simulations": 5, "seed": 3, **spoil(out)}
+    with pytest.raises(CalibError, match=message):
+        run_sbc(out, **arguments)
+
+
+def test_a_folder_of_something_else_is_not_touched(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(CalibError, match="holds no simulation-based calibration"):
+        run_sbc(tmp_path, simulations=3, seed=1)
+    assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_replicates_that_fail_are_named_and_the_others_are_scored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from calib.validation import sbc as module
+
+    whole = module.replicate
+
+    def broken(item):
+        if item.index == 1:
+            raise CalibError("no luck")
+        return whole(item)
+
+    monkeypatch.setattr(module, "replicate", broken)
+    found = run_sbc(tmp_path / "run", models=NAMES[:1], simulations=3, seed=1, settings=QUICK)
+    assert list(found.models[0].failed) == ["bekker-0001"]
+    assert found.models[0].replicates == 2
+    assert "(1 failed)" in text_table(found)
+
+
+def test_a_miscalibration_is_said_first(out: Path) -> None:
+    from dataclasses import replace
+
+    found = run_sbc(out, models=("bekker",), simulations=5, seed=3)
+    (model,) = found.models
+    spoilt = replace(model.quantities[0], p=1e-6)
+    bad = replace(found, models=(replace(model, quantities=(spoilt, *model.quantities[1:])),))
+    assert verdict(bad).startswith("MISCALIBRATED: k of bekker")
+
+
+def test_a_prior_file_chooses_the_noise_that_is_proved(tmp_path: Path) -> None:
+    path = tmp_path / "heavy.toml"
+    text = default_priors("modified_bekker").read_text(encoding="utf-8")
+    path.write_text(f'{text}\n[likelihood]\nfamily = "student_t"\nnoise_depends_on = "slip"\n')
+    options = {"simulations": 2, "seed": 1, "settings": SHORT}
+    found = run_sbc(tmp_path / "run", models=NAMES, priors=[path], **options)
+    named = {m.model: {q.name for q in m.quantities} for m in found.models}
+    assert {"nu", "sigma_slope", "sigma"} <= named["modified_bekker"]
+    assert "nu" not in named["bekker"]
+    # A run of other priors is another run.
+    with pytest.raises(CalibError, match="other sampler settings or priors"):
+        run_sbc(tmp_path / "run", models=NAMES, **options)
+    with pytest.raises(CalibError, match="priors of modified_bekker"):
+        run_sbc(tmp_path / "other", models=NAMES[:1], priors=[path], **options)
+
+
+def test_a_run_that_was_killed_as_it_began_begins_again(tmp_path: Path) -> None:
+    (tmp_path / ".run.json.part").write_text('{"see', encoding="utf-8")
+    run_sbc(tmp_path, models=["bekker"], simulations=2, seed=3, settings=SHORT)
+    assert json.loads((tmp_path / "run.json").read_text(encoding="utf-8"))["seed"] == 3
+
+
+def test_the_option_of_correlated_noise_is_simulated(tmp_path: Path) -> None:
+    priors = tmp_path / "along.toml"
+    extra = '\n[likelihood]\ncorrelated_along = "run_order"\n'
+    priors.write_text(default_priors("bekker").read_text(encoding="utf-8") + extra, "utf-8")
+    score = run_sbc(
+        tmp_path / "out", models=["bekker"], simulations=2, seed=3, settings=SHORT, priors=[priors]
+    )
+    assert "rho" in {quantity.name for quantity in score.models[0].quantities}
