@@ -47,7 +47,6 @@ VERBS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("run.json", "data.csv", "priors.toml"),
     ),
 }  # fmt: skip
-CHECK = ("check", "run", "--workers", "1", "--json")
 RUNS = Path("wheel.runs")
 
 
@@ -135,41 +134,6 @@ def kill_and_go_again(verb: str, times: int, rng: np.random.Generator) -> int:
     return cut_short
 
 
-def everything(folder: Path) -> dict[str, str]:
-    return {
-        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in folder.rglob("*") if path.is_file()
-    }  # fmt: skip
-
-
-def check() -> tuple[int, dict[str, object]]:
-    """Check a run; return the exit code and all that was said."""
-    process = start(CHECK, subprocess.PIPE)
-    out, _ = process.communicate(timeout=300)
-    return process.returncode, json.loads(out)
-
-
-def kill_checks(times: int, rng: np.random.Generator) -> int:
-    """Kill checks of a run at random moments; return how many had not ended."""
-    words = (*VERBS["fit"][0][:-1], "run")
-    assert start(words).wait(timeout=300) in (0, 3)
-    before, beside = everything(Path("run")), set(Path().iterdir())
-    began = time.monotonic()
-    said = check()
-    took = time.monotonic() - began
-    assert said[1]["verdict"] == "same"
-    cut_short = 0
-    for _ in range(times):
-        process = start(CHECK)
-        kill(process, took * rng.uniform(0.05, 1.0))
-        cut_short += process.returncode == -signal.SIGKILL
-        # Its scratch folder is the system's, for temporary files; here there is nothing new.
-        assert everything(Path("run")) == before
-        assert set(Path().iterdir()) == beside
-        assert check() == said
-    return cut_short
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("verb", "times"), [
     ("fit", 12), ("report", 12), ("diagnose", 12), ("sbc", 10), ("simulator", 8),
@@ -181,10 +145,3 @@ def test_fifty_kills_lose_nothing(verb: str, times: int, folder: Path) -> None:
     assert cut_short > 0
     if verb == "simulator":
         assert begun_runs() > 30
-
-
-@pytest.mark.slow
-def test_a_check_that_is_killed_changes_nothing(folder: Path) -> None:
-    cut_short = kill_checks(8, np.random.default_rng())
-    print(f"check: killed 8 times, {cut_short} of them before there was a verdict")
-    assert cut_short > 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import resource
 import shutil
@@ -656,34 +655,6 @@ def test_an_interruption_says_what_is_there(monkeypatch: pytest.MonkeyPatch) -> 
     assert "nothing was written" not in done.stderr
     assert "calib: what was finished is in run" in done.stderr
     calib.load_calibration(Path("run"))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_whenever_it_is_stopped_folders_are_whole(number: int) -> None:
-    words = ["compare", "bekker", "modified_bekker", "slip.csv", "--max-steps", "400", "--workers",
-             "1", "--out", "both"]  # fmt: skip
-    rng = np.random.default_rng(number)
-    for _ in range(8):
-        with subprocess.Popen(
-            [*PROGRAM, *words], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
-            env=os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)},
-        ) as process:  # fmt: skip
-            try:
-                process.wait(rng.uniform(0.5, 6.0))
-            except subprocess.TimeoutExpired:
-                process.send_signal(number)
-            _, said = process.communicate(timeout=60)
-        assert process.returncode in (0, 3, 130, -number), said
-        assert "Traceback" not in said, said
-        for folder in Path().glob("both-unfinished/*"):
-            if (folder / "run.json").exists():
-                calib.load_calibration(folder)
-        if Path("both").exists():
-            assert json.loads(Path("both/comparison.json").read_bytes())["models"]
-        assert not list(Path().glob(".both-*"))
-        for left in Path().glob("both*"):
-            shutil.rmtree(left)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
