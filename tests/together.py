@@ -33,7 +33,7 @@ GROUPS = (
     ("batch/campaign/test_run.py", "batch/campaign/test_kinds.py", "batch/campaign/test_plan.py"),
     ("inference/emulation/test_emulate.py",),
     ("inference/sampling/test_sampler.py",),
-    ("batch/tasks/test_cluster.py",),
+    ("batch/test_cluster.py",),
     ("cli/test_cli.py",),
     ("challenge/test_make.py", "gap/test_well_specified.py", "cli/test_challenge.py"),
     ("check/test_check_compared.py",),
