@@ -197,7 +197,7 @@ def test_evidence_of_other_validations(density, rut, unconverged):
 
 
 def test_verdicts_draw_nothing():
-    code = "import sys, calib.report.verdict, calib.report.gap_evidence"
+    code = "import sys, calib.report.verdict, calib.report.gap_words"
     done = [sys.executable, "-c", f"{code}; print('matplotlib' in sys.modules)"]
     found = subprocess.run(done, capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "False"
