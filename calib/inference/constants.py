@@ -11,7 +11,7 @@ NEGLIGIBLE_NATS = 15.0  # nats below the highest mode, where no mass is; test_mo
 SAME_MODE = 25.0  # squared standard distance of ascents to one mode; test_modes
 
 # Proposal
-ROUND_SIZES = (60, 120, 250, 400)  # draws per dimension + 5 of each round; test_proposal
+ROUND_SIZES = (60, 120, 250, 400, 400, 400)  # draws per dimension + 5; test_proposal
 GOOD_EFFICIENCY = 0.9  # better proposals are not worth a round; test_proposal
 MOST_COMPONENTS = 16  # of a mixture about one mode; test_proposal
 FITTED_DRAWS = 6000  # draws; a fit to more is no better; test_proposal

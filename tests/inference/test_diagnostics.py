@@ -147,7 +147,7 @@ def test_a_run_that_cannot_move_is_refused() -> None:
         nonlocal calls
         calls += 1
         keys = [row.tobytes() for row in t]
-        if calls <= 8:  # four rounds of adaptation, and the starts of four ensembles
+        if calls <= 10:  # six rounds of adaptation, and the starts of four ensembles
             seen.update(keys)
         return np.where([key in seen for key in keys], 0.0, -np.inf)
 

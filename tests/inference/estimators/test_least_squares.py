@@ -25,7 +25,7 @@ def test_recovers_known_parameters(problem_of, model):
     assert set(found.reported) == set(problem.bound.model.reported)
 
 
-@pytest.mark.parametrize("model", ["magic_formula", "modified_bekker", "ayers_perumpral"])
+@pytest.mark.parametrize("model", ["magic_formula", "ayers_perumpral"])
 def test_all_methods_agree_on_noisy_data(problem_of, model):
     problem, _ = problem_of(model, noise=0.02)
     best = estimate(problem, "least_squares", np.random.default_rng(RNG))
