@@ -162,7 +162,7 @@ def _needed(
         room = state.left - checks
         small = history[-1][1] <= WORTH * chosen.tolerance
         if state.emulator is not None and state.emulator.support is not None:
-            # An edge has to be found besides: so many more batches as make the error small twice.
+            # An edge has to be found as well: the error has to be small twice in a row.
             last = [error for _, error in history[began:]][-2:]
             small = len(last) > 1 and max(last) <= EDGE_WORTH * chosen.tolerance
         if room < 1 or (all_ran and small):

@@ -50,7 +50,7 @@ class EmulationSettings:
     tolerance : float
         Largest rms error of the emulator over rows and posterior, in sds of the noise. It is
         checked when somewhat less is expected. At 0.1 the error adds 1 % to the variance of a
-        reading; it is in the likelihood besides.
+        reading, which the likelihood accounts for.
     nodes : int, optional
         Conditions at which each run is evaluated, see `calib.inference.design`.
     sequential : bool

@@ -18,6 +18,7 @@ from calib.inference.proposal import Guess
 from calib.inference.sampler import (
     Draws,
     SamplerSettings,
+    anneal,
     sample_density,
     sample_posterior,
 )
@@ -277,3 +278,36 @@ def test_draws_of_a_calibration_belong_together(rut_calibration) -> None:
     np.testing.assert_array_equal(draws.flat[-1], draws.t[-1, -1, -1])
     assert 0.0 < draws.acceptance < 1.0
     assert draws.evaluations > draws.t[..., 0].size
+
+
+def wide(t):
+    return stats.norm.logpdf(t, 0.0, 10.0).sum(axis=1)
+
+
+def test_draws_that_are_annealed_keep_the_proportions_of_modes() -> None:
+    def two(t):
+        one, other = (stats.norm.logpdf(t[:, 0], m, 0.1) for m in (-5.0, 5.0))
+        return np.logaddexp(np.log(0.2) + one, np.log(0.8) + other) + stats.norm.logpdf(t[:, 1])
+
+    shares = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        found = anneal(wide, two, 10.0 * rng.standard_normal((1000, 2)), rng)
+        assert found is not None
+        shares.append((found[:, 0] < 0.0).mean())
+        # Resampled draws are worth fewer than as many independent ones: a fifth at the least.
+        assert abs(found[:, 1].mean()) < 5.0 / np.sqrt(200)
+        assert found[:, 1].std() == pytest.approx(1.0, abs=5.0 / np.sqrt(2.0 * 200))
+    assert abs(np.mean(shares) - 0.2) < 5.0 * np.std(shares) / np.sqrt(len(shares))
+    assert min(shares) > 0.05
+
+
+def test_draws_are_annealed_to_where_the_density_is_positive() -> None:
+    edge = 10.0 * stats.norm.ppf(0.01)
+    rng = np.random.default_rng(1)
+    draws = 10.0 * rng.standard_normal((1000, 2))
+    found = anneal(wide, lambda t: np.where(t[:, 0] < edge, wide(t), -np.inf), draws, rng)
+    assert found is not None
+    assert (found[:, 0] < edge).all()
+    assert len(np.unique(found[:, 0])) > 500
+    assert anneal(wide, lambda t: np.full(len(t), -np.inf), draws, rng) is None
