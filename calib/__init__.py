@@ -36,51 +36,31 @@ if TYPE_CHECKING:
     from calib.validation.validate import Validation, leave_one_out, validate_held_out
 
 _HOME = {
-    "Audit": "calib.he2019.audit",
-    "run_audit": "calib.he2019.audit",
-    "Calibration": "calib.inference.calibration",
-    "calibrate": "calib.inference.calibration",
-    "read_plan": "calib.batch.campaign",
-    "run_campaign": "calib.batch.campaign",
-    "Table": "calib.data",
-    "Quantity": "calib.data.quantities",
-    "Range": "calib.data.quantities",
-    "register": "calib.data.registry",
-    "hold_out": "calib.data",
-    "read_table": "calib.data",
-    "table_from_arrays": "calib.data",
-    "load_he2019": "calib.he2019.embedded",
-    "CalibError": "calib.errors",
-    "Emulation": "calib.inference.emulation",
-    "emulated": "calib.inference.emulation.prepared",
-    "from_callable": "calib.models.simulators.declaration",
-    "read_simulator": "calib.models.simulators.declaration",
-    "PointEstimate": "calib.inference.estimators",
-    "estimate": "calib.inference.estimators",
-    "Case": "calib.gap.case",
-    "read_case": "calib.gap.case",
-    "Diagnosis": "calib.gap.diagnose",
-    "diagnose": "calib.gap.diagnose",
-    "MODELS": "calib.models",
-    "Model": "calib.models",
-    "Effect": "calib.gap.effects",
-    "Prediction": "calib.validation.prediction",
-    "predict": "calib.validation.prediction",
-    "Problem": "calib.inference.problem",
-    "build_problem": "calib.inference.problem",
-    "check": "calib.check.check",
-    "Comparison": "calib.validation.comparison",
-    "compare": "calib.validation.comparison",
-    "SamplerSettings": "calib.inference.sampler",
-    "load_calibration": "calib.inference.io",
-    "save_calibration": "calib.inference.io",
-    "to_datatree": "calib.inference.io",
-    "Validation": "calib.validation.validate",
-    "Verdict": "calib.report.verdict",
-    "verdict": "calib.report.verdict",
-    "gap_verdict": "calib.report.gap_words",
-    "leave_one_out": "calib.validation.validate",
-    "validate_held_out": "calib.validation.validate",
+    "calib.batch.campaign": "read_plan run_campaign",
+    "calib.check.check": "check",
+    "calib.data": "Table hold_out read_table table_from_arrays",
+    "calib.data.quantities": "Quantity Range",
+    "calib.data.registry": "register",
+    "calib.errors": "CalibError",
+    "calib.gap.case": "Case read_case",
+    "calib.gap.diagnose": "Diagnosis diagnose",
+    "calib.gap.effects": "Effect",
+    "calib.he2019.audit": "Audit run_audit",
+    "calib.he2019.embedded": "load_he2019",
+    "calib.inference.calibration": "Calibration calibrate",
+    "calib.inference.emulation": "Emulation",
+    "calib.inference.emulation.prepared": "emulated",
+    "calib.inference.estimators": "PointEstimate estimate",
+    "calib.inference.io": "load_calibration save_calibration to_datatree",
+    "calib.inference.problem": "Problem build_problem",
+    "calib.inference.sampler": "SamplerSettings",
+    "calib.models": "MODELS Model",
+    "calib.models.simulators.declaration": "from_callable read_simulator",
+    "calib.report.gap_words": "gap_verdict",
+    "calib.report.verdict": "Verdict verdict",
+    "calib.validation.comparison": "Comparison compare",
+    "calib.validation.prediction": "Prediction predict",
+    "calib.validation.validate": "Validation leave_one_out validate_held_out",
 }
 
 __all__ = [
@@ -135,9 +115,10 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name == "__version__":
         return import_module("importlib.metadata").version("terracalib")
-    if name not in _HOME:
-        raise AttributeError(f"module 'calib' has no attribute {name!r}")
-    return getattr(import_module(_HOME[name]), name)
+    for home, names in _HOME.items():
+        if name in names.split():
+            return getattr(import_module(home), name)
+    raise AttributeError(f"module 'calib' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

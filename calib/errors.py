@@ -8,7 +8,7 @@ import reprlib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-# What somebody else's file makes the reading of it raise.
+# What reading somebody else's file may raise.
 FAULTS = (AttributeError, LookupError, OSError, RuntimeError, TypeError, ValueError)
 
 
@@ -23,7 +23,7 @@ class CalibError(Exception):
         File, row, column or parameter at which it was found.
     expected : str, optional
         What would have been accepted there.
-    mend : str, optional
+    hint : str, optional
         What to do about it.
     """
 
@@ -78,10 +78,6 @@ def meant(name: str, known: Iterable[str], otherwise: str = "correct the name") 
     return f"did you mean {' or '.join(near)}?" if near else otherwise
 
 
-_PLAIN = {"dictionary": "table", "string": "text", "integer": "whole number", "valid ": "",
-          "a boolean": "true or false"}  # fmt: skip
-
-
 def in_words(error: Mapping[str, Any]) -> str:
     """Say what pydantic, one of whose `errors` this is, found wrong in a file."""
     kind, said = error["type"], error["msg"]
@@ -97,7 +93,8 @@ def in_words(error: Mapping[str, Any]) -> str:
         return f"{said.removeprefix('Value error, ')} (found {reprlib.repr(error['input'])})"
     if should.startswith("a valid"):
         should = re.split(", | or ", should)[0]
-        for its, plain in _PLAIN.items():
+        words = {"dictionary": "table", "string": "text", "integer": "whole number", "valid ": ""}
+        for its, plain in {**words, "a boolean": "true or false"}.items():
             should = should.replace(its, plain)
     return f"{key} = {reprlib.repr(error['input'])} is not {should}"
 

@@ -26,10 +26,7 @@ from tests.report.figures.fixtures import (  # noqa: F401
     rut,
     unconverged,
 )
-from tests.together import (  # noqa: F401
-    pytest_collection_modifyitems,
-    pytest_xdist_make_scheduler,
-)
+from tests.together import pytest_collection_modifyitems  # noqa: F401
 
 SEED = 2019
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.cli.test_cli import calib as run  # noqa: F401
+from tests.commands import calib as run  # noqa: F401
 from tests.extension.test_simulators import as_before, field, write_table  # noqa: F401
 from tests.models.simulators.examples import lab
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
 from pathlib import Path
 
 import pytest
@@ -16,6 +15,7 @@ GROUPS = (
     ("check/test_check_report.py", "check/test_processors.py", "check/test_check_whole.py",
      "check/test_check_run.py", "check/test_check_comparison.py"),
     ("check/test_reference_report.py",),
+    ("check/test_tolerances.py", "check/test_check_diagnosis.py", "docs/test_formats.py"),
     # Calibrations of the embedded data, and the pages and figures on them.
     ("report/figures/test_print.py", "report/figures/test_plates.py", "report/test_writer.py",
      "report/test_verdict.py", "report/test_words.py", "report/page/test_page.py",
@@ -36,7 +36,6 @@ GROUPS = (
     ("batch/test_cluster.py",),
     ("cli/test_cli.py",),
     ("challenge/test_make.py", "gap/test_well_specified.py", "cli/test_challenge.py"),
-    ("check/test_check_compared.py",),
     ("docs/test_snippets.py",),
     ("gap/test_batch.py",),
     ("abuse/test_mutilated_files.py",),
@@ -47,34 +46,15 @@ GROUPS = (
 )  # fmt: skip
 
 
-@cache
-def place_of(file: str) -> int:
-    """Return which group a file of the tests belongs to; their number where none."""
-    whole = (i for i, names in enumerate(GROUPS) if file.startswith(names))
-    return next(whole, len(GROUPS))
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Name the group of every test for `--dist loadgroup`, and put the longest groups first."""
 
+    def place(item: pytest.Item) -> int:
+        file = item.path.relative_to(TESTS).as_posix()
+        return next((i for i, names in enumerate(GROUPS) if file.startswith(names)), len(GROUPS))
 
-def group_of(path: str) -> str:
-    """Return the group of a file, given from the folder of the project."""
-    file = path.removeprefix("tests/")
-    place = place_of(file)
-    return f"group {place}" if place < len(GROUPS) else file
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config, log):
-    """Share groups out in their order; without it files, those of the most tests first."""
-    from xdist.scheduler import LoadScopeScheduling
-
-    class Groups(LoadScopeScheduling):
-        def _split_scope(self, nodeid: str) -> str:
-            return group_of(nodeid.partition("::")[0])
-
-    config.option.loadscopereorder = False
-    return Groups(config, log)
-
-
-def pytest_collection_modifyitems(config, items) -> None:
-    """Put the longest groups first in the processes that share the work."""
-    if hasattr(config, "workerinput"):
-        items.sort(key=lambda item: place_of(item.path.relative_to(TESTS).as_posix()))
+    items.sort(key=place)
+    for item in items:
+        own = place(item) == len(GROUPS)
+        group = item.path.relative_to(TESTS).as_posix() if own else f"group {place(item)}"
+        item.add_marker(pytest.mark.xdist_group(group))

@@ -42,10 +42,8 @@ from calib.validation.validate import (
 
 MONTE_CARLO = "Monte Carlo"
 
-# Chance of one false alarm or more in a whole check.
-_FAMILY = 1e-3
-# Over 24 seeds numbers moved by up to 1.4 times what ArviZ expects: walkers are not quite chains.
-_SAFETY = 1.5
+_FAMILY = 1e-3  # chance of one false alarm or more in a whole check
+_SAFETY = 1.5  # walkers are not quite chains: numbers move by up to 1.4 times what ArviZ expects
 
 
 def multiple(n: int) -> float:
@@ -159,6 +157,7 @@ class Tolerance:
 
 ARITHMETIC = Tolerance("arithmetic", 1e-6)
 _DRAWN = Tolerance(MONTE_CARLO, 1.0, "Monte Carlo error")
+_WORDS = Tolerance("words", words=True, judged=False)
 _EITHER = Tolerance("beside a threshold, or one of several nearly equal modes", judged=False)
 _READ_OFF = Tolerance("read off numbers against thresholds")
 
@@ -167,7 +166,9 @@ def _chance(part: float) -> Tolerance:
     return Tolerance("diagnosis", part, "one")
 
 
-_M, _GAP, _FOUND = "summary.json/models/*", "summary.json/paper_gaps/*", "gaps/*/diagnosis.json"
+_M, _GAP = "summary.json/models/*", "summary.json/paper_gaps/*"
+_OF_GAP = "(gaps/*/|)"  # in a report, or a folder of its own
+_FOUND = f"{_OF_GAP}diagnosis.json"
 _SEARCHES = "(genetic|differential_evolution)"
 _PARAMETERS = f"({_GAP}|{_FOUND}/effects/*)/parameters/*"
 _COMPARED = "comparison.json/models/*"
@@ -186,7 +187,9 @@ TABLE: tuple[tuple[str, Tolerance], ...] = (
     (f"({_M}/fit/*/note|audit.json/findings/*/evidence)", Tolerance("words", words=True)),
     # Some from the mode, which stops a little elsewhere.
     (f"(({_M}/sampling|run.json/gate)/reasons|{_M}/warnings|{_M}/noise/against_normal/sentence)"
-     "(|/*)", Tolerance("words", words=True, judged=False)),
+     "(|/*)", _WORDS),
+    # A case that is kept has the names of its own files.
+    (f"{_FOUND}/warnings/*", _WORDS),
     # Point estimates
     (f"{_M}/estimates/{_SEARCHES}/*", Tolerance("random search", 1.0, "posterior sd")),
     (f"({_M}/(estimates/*|sampling/mode)|run.json/(estimates/*/reported|mode))/*",
@@ -245,18 +248,15 @@ TABLE: tuple[tuple[str, Tolerance], ...] = (
     (f"{_FOUND}/where/*/gap", Tolerance("diagnosis", 0.3, "sd beside it")),
     (f"{_FOUND}/where/*/gap_sd", Tolerance("diagnosis", 0.25)),
     (f"{_FOUND}/where/*/probability", _chance(0.15)),
-    ("gaps/*/fresh_prediction.csv/*/*_(before|after|after_lower|after_upper)",
+    (f"{_OF_GAP}fresh_prediction.csv/*/*_(before|after|after_lower|after_upper)",
      Tolerance("diagnosis", 0.2, "width of its interval")),
     # A hundredth of a posterior sd, of coordinates of the order of one.
-    ("gaps/*/corrected.json/lab_mode/*/*", Tolerance("optimum", 1e-3, floor=1e-3)),
+    (f"{_OF_GAP}corrected.json/lab_mode/*/*", Tolerance("optimum", 1e-3, floor=1e-3)),
     # The audit: least costs of searches from many starts; two findings rest on posterior draws.
     ("audit.json/findings/(table6_likelihood|table6_prediction_at_30)/found/*",
      Tolerance(MONTE_CARLO, 0.15, "width of its interval")),
     ("audit.json/findings/*/found/*", Tolerance("random search", 1e-3)),
 )  # fmt: skip
-
-# Parameters of hypotheses less probable than this are not judged: they may be at another mode.
-_COUNTS = 0.2
 
 
 def tolerance_of(place: Place, entries: Entries) -> Tolerance:
@@ -264,14 +264,16 @@ def tolerance_of(place: Place, entries: Entries) -> Tolerance:
     found = _row("/".join(place))
     if found is _READ_OFF:
         return _EITHER if _near_threshold(place, entries) else ARITHMETIC
+    # A hypothesis as improbable may be at another mode.
+    improbable = 0.2
     if found.of == "sd beside it" and "effects" in place:
         hypothesis = place[: place.index("effects") + 2]
-        if (entries.get((*hypothesis, "probability")) or 0.0) < _COUNTS:
+        if (entries.get((*hypothesis, "probability")) or 0.0) < improbable:
             return replace(found, judged=False)
     if place[-2:-1] == ("share_interval",):
         # An end is nothing or not where a twentieth of the draws that have a gap hangs on it.
         p = entries.get((*place[:-2], "probability")) or 0.0
-        if p < _COUNTS if place[-1] == "1" else 0.9 < p < 0.99:
+        if p < improbable if place[-1] == "1" else 0.9 < p < 0.99:
             return replace(found, judged=False)
     return found
 
@@ -290,7 +292,7 @@ def _near_threshold(place: Place, entries: Entries) -> bool:
         if not isinstance(value, float):
             return True
         # Other seeds moved it by no more than half of its tolerance.
-        size = 0.5 * (row.part * (natural_scale(row.of, at, entries, {}) or 0.0) + row.floor)
+        size = 0.5 * (allowed_difference(row, at, value, entries, {}) or 0.0)
         ends.append((value - size, value + size))
     moved = (Sensitivity("", *numbers) for numbers in product(*ends))
     return len({(s.identified, s.reading) for s in moved}) > 1
@@ -298,43 +300,52 @@ def _near_threshold(place: Place, entries: Entries) -> bool:
 
 @cache
 def _row(path: str) -> Tolerance:
-    return next((t for pattern, t in _PATTERNS if pattern.fullmatch(path)), ARITHMETIC)
+    return next((t for pattern, t in TABLE if compiled(pattern).fullmatch(path)), ARITHMETIC)
 
 
-_SIGNS = {"*": ".*", "(": "(?:", ")": ")", "|": "|"}
-_PATTERNS = tuple(
-    (re.compile("".join(_SIGNS.get(c, re.escape(c)) for c in pattern)), tolerance)
-    for pattern, tolerance in TABLE
-)
+@cache
+def compiled(pattern: str) -> re.Pattern[str]:
+    """Return the regular expression of a row's pattern."""
+    signs = {"*": ".*", "(": "(?:", ")": ")", "|": "|"}
+    return re.compile("".join(signs.get(c, re.escape(c)) for c in pattern))
 
 
-def natural_scale(of: Of, place: Place, entries: Entries, errors: Errors) -> float | None:
-    """Return the natural scale of a number, by its path among entries computed again, or None.
+def allowed_difference(
+    tolerance: Tolerance, place: Place, old: Any, entries: Entries, errors: Errors
+) -> float | None:
+    """Return the largest difference that is taken for the same; None where none can be stated.
 
-    `errors` is what Monte Carlo error allows, by paths.
+    Of a number that was `old`, by its path among `entries` computed again; `errors` is what Monte
+    Carlo error allows, by paths.
     """
     *above, last = place
-    value = entries.get(place)
-    size = abs(value) if isinstance(value, int | float) else 0.0
-    match of:
+    new = entries[place]
+    size, scale = abs(new), None
+    if tolerance == ARITHMETIC and isinstance(new, int):
+        return 0.0  # a count, or a seed
+    match tolerance.of:
+        case "itself":
+            scale = size
         case "one":
-            return 1.0
+            scale = 1.0
         case "Monte Carlo error":
-            return errors.get(place, 0.0)
+            scale = errors.get(place, 0.0)
         case "what is left to one":
-            return 1.0 - size
+            scale = 1.0 - size
         case "what is left unexplained":
-            return size / max(1.0 - (entries.get((*above, "r_squared")) or 0.0), 1e-9)
+            scale = size / max(1.0 - (entries.get((*above, "r_squared")) or 0.0), 1e-9)
         case "ratio" if last.startswith("mcse_") and errors.get((*above, "sd"), 0.0) is None:
             return None
+        case "ratio":
+            return float((tolerance.part - 1.0) * min(abs(old), size))
         case "posterior sd":
-            return _posterior_sd(place, entries, errors) or size
+            scale = _posterior_sd(place, entries, errors) or size
         case "sd beside it":
-            return entries.get((*above, {"mean": "sd", "gap": "gap_sd"}[last]))
+            scale = entries.get((*above, {"mean": "sd", "gap": "gap_sd"}[last]))
         case "width of its interval":
             band = re.fullmatch(r"(.*)_(before|after|after_lower|after_upper)", last)
-            return _width((*above, f"{band[1]}_after_" if band else ""), entries)
-    return size
+            scale = _width((*above, f"{band[1]}_after_" if band else ""), entries)
+    return None if scale is None else tolerance.part * scale + tolerance.floor
 
 
 def _posterior_sd(place: Place, entries: Entries, errors: Errors) -> float:

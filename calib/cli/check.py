@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from calib.check.outcome import Item, Outcome
+    from calib.check.check import Outcome
+    from calib.check.compare import Item
     from calib.he2019.audit import Audit
 
 _Quick = Annotated[
@@ -27,11 +28,14 @@ _Quick = Annotated[
 
 
 def check(
-    folder: Annotated[Path, typer.Argument(help="Folder of `calib report`, `fit` or `compare`.")],
+    folder: Annotated[
+        Path, typer.Argument(help="Folder of `calib report`, `fit`, `compare` or `diagnose`.")
+    ],
     quick: _Quick = False,
     every: Annotated[
         bool, typer.Option("--all", help="List every number, not only what is not the same.")
     ] = False,
+    effects: opt.EffectsFile = None,
     workers: opt.Workers = opt.CORES,
     plugins: opt.Models = None,
     simulator: opt.Simulators = None,
@@ -42,7 +46,7 @@ def check(
     Ends with 0 where all is the same, 1 where something differs, 2 where it cannot be checked.
     """
     try:
-        outcome = _checked(folder, quick, workers)
+        outcome = _checked(folder, quick, workers, effects)
     except CalibError as error:
         reason = {"verdict": "cannot be checked", "reason": str(error), "exit_code": 2}
         finish(0, {"folder": str(folder), **reason})
@@ -51,7 +55,7 @@ def check(
     finish(outcome.exit_code, outcome.document())
 
 
-def _checked(folder: Path, quick: bool, workers: int) -> Outcome:
+def _checked(folder: Path, quick: bool, workers: int, effects: Path | None = None) -> Outcome:
     from calib.batch.pool import pool
     from calib.check.check import check as check_folder
     from calib.models.simulators.declaration import load_files
@@ -59,12 +63,14 @@ def _checked(folder: Path, quick: bool, workers: int) -> Outcome:
     # A slow simulator is checked as it was emulated: nothing is run.
     load_files(sorted((folder / "emulators").glob("*.npz")))
     with pool(1 if quick else workers) as side, progress_bars() as tell:
-        return check_folder(folder, quick=quick, progress=tell, pool=side, workers=workers)
+        return check_folder(
+            folder, quick=quick, effects=effects, progress=tell, pool=side, workers=workers
+        )
 
 
 def show(outcome: Outcome, *, every: bool) -> None:
     """Print what a check found: every number and file, or only those that are not the same."""
-    from calib.check.outcome import Status
+    from calib.check.compare import Status
 
     console = wide_console()
     console.print(outcome.verdict, soft_wrap=True)
@@ -91,7 +97,7 @@ def _groups(outcome: Outcome) -> Table:
     """One row for each group: how many of its entries are what."""
     from rich.table import Table
 
-    from calib.check.outcome import Status
+    from calib.check.compare import Status
     from calib.data.files import plain_number
 
     table = Table()

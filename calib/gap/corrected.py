@@ -20,7 +20,7 @@ from calib.data import Table, write_table
 from calib.data.quantities import OUTPUTS, role_of
 from calib.errors import CalibError
 from calib.gap.campaigns import Campaigns, campaigns
-from calib.gap.case import cells, read_case, with_declared
+from calib.gap.case import Context, cells, read_case, with_declared
 from calib.gap.constants import NAMED, SMALLEST_GAP, SURPRISE, WORTH_SAYING
 from calib.gap.discrepancy import ShiftMap
 from calib.gap.effects import EFFECTS, Effect
@@ -109,6 +109,7 @@ def save_corrected(corrected: Corrected, folder: Path) -> None:
     lines += ["", "[covariates]"] if case.covariates else []
     for name, levels in case.covariates.items():
         lines.append(f"{json.dumps(name)} = {json.dumps(list(levels) or 'number')}")
+    lines += _context_lines(case.context) if case.context else []
     (inner / "case.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
     content = {
         "schema": SCHEMA,
@@ -122,6 +123,15 @@ def save_corrected(corrected: Corrected, folder: Path) -> None:
         ],
     }
     (folder / "corrected.json").write_text(json.dumps(content) + "\n", encoding="utf-8")
+
+
+def _context_lines(context: Context) -> list[str]:
+    lines = ["", "[context]", f"excluded = {json.dumps(list(context.excluded))}"]
+    lines += ["[context.suspected]", *(f"{name} = {p!r}" for name, p in context.suspected.items())]
+    for name, sizes in context.sizes.items():
+        lines.append(f"[context.sizes.{name}]")
+        lines += [f"{p} = {{mean = {s.mean!r}, sd = {s.sd!r}}}" for p, s in sizes.items()]
+    return lines
 
 
 def _fit_document(fit: Fit, probability: float) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from calib.gap.corrected import load_corrected, save_corrected
 from calib.gap.describe import gap_document
 from calib.gap.diagnose import Diagnosis
 from calib.gap.document import BENCH, FILE, Cause, Explanation, GapDocument
+from calib.gap.effects import EFFECTS, Effect
 from calib.gap.mixture import Region, row_gaps
 
 SCHEMA = "calib/diagnosis/1"
@@ -157,14 +158,14 @@ def misquoted(said: Any, folder: Path) -> str:
     return f"not the same: {', '.join(apart)}" if apart else ""
 
 
-def mispredicted(folder: Path) -> str:
+def mispredicted(folder: Path, effects: Mapping[str, Effect] = EFFECTS) -> str:
     """Say what is wrong with a corrected model that does not predict the gaps of its diagnosis.
 
     It is drawn from, and a normal may be drawn otherwise by another processor: the means of
     hundreds of draws agree within a third of their sd.
     """
     try:
-        corrected = load_corrected(folder)
+        corrected = load_corrected(folder, effects)
         where = _diagnosis(folder)["where"]
         stated = {(e["output"], e["row"]): (e["gap"], e["gap_sd"]) for e in where}
         for g in row_gaps(corrected.data, corrected.mixture.at(corrected.data.view)):

@@ -98,7 +98,7 @@ class Record(Entry):
     """What a folder of any kind says of itself, in one of its files."""
 
     FILE: ClassVar[str]
-    kind: ClassVar[Literal["report", "run", "comparison"]]
+    kind: ClassVar[Literal["report", "run", "comparison", "diagnosis"]]
     WRITTEN_BY: ClassVar[str]
     versions: dict[str, str]
     machine: dict[str, str]

@@ -236,7 +236,7 @@ class Check(_Exactly):
 
     schema_: Literal["calib/check/1"] = Field(alias="schema")
     folder: str
-    kind: Literal["report", "run", "comparison"]
+    kind: Literal["report", "run", "comparison", "diagnosis"]
     quick: bool
     verdict: Literal["same", "different"]
     headline: str

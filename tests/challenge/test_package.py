@@ -11,7 +11,7 @@ import pytest
 import challenge
 from calib.batch.campaign.kinds import ChallengeSection
 from challenge.make import NULL_FRACTION
-from tests.cli.test_cli import Calib
+from tests.commands import Calib
 
 ROOT = Path(challenge.__path__[0]).parent
 PLAN = '[[challenge]]\nname = "blind"\ncases = 1\ndraw_seed = 5\n'

@@ -6,6 +6,7 @@ found there as here. ``CALIB_MADE_UNDER`` names another setting (`kernels.Settin
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 import shutil
@@ -19,52 +20,33 @@ import pytest
 
 import calib.check.check as check_module
 from calib.batch.environment import sha256
-from calib.check import compare, tolerances
-from calib.check.check import check, recompute_report
-from calib.check.outcome import Outcome, Status
+from calib.check import compare, folders, tolerances
+from calib.check.check import Outcome, check, recompute_report
+from calib.check.compare import Status
+from calib.gap.diagnose import diagnose
 from calib.he2019 import sections
 from calib.he2019.audit import begin_audit
-from calib.inference.calibration import Calibration
 from calib.inference.io import recompute_run
 from calib.report.publish import publication
 from calib.report.writer import file_hashes
 from calib.validation.validate import posterior_errors
-from tests.check.kernels import ALL, FEW, Setting
+from tests.check.kernels import ALL, FEW
 
 from . import made
 
-# What a manifest has of the hashes of its files, from which nothing is computed.
-_OWN = {"files", "left_out"}
-
-
-def made_under() -> Setting | None:
-    """The processor that the originals are made on; None for this one."""
-    named = os.environ.get("CALIB_MADE_UNDER")
-    if named:
-        return next(setting for setting in ALL if str(setting) == named)
-    return FEW[0] if FEW else None
+type Change = Callable[[Path], object]
 
 
 @pytest.fixture(scope="package")
 def originals(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of all of them (`made.KINDS`); importing takes as long as making one."""
-    setting, out = made_under(), tmp_path_factory.mktemp("original")
-    if setting is not None:
-        return made.elsewhere(out, setting, *made.KINDS)
+    named, out = os.environ.get("CALIB_MADE_UNDER"), tmp_path_factory.mktemp("original")
+    settings = [s for s in ALL if str(s) == named] if named else FEW[:1]
+    if settings:
+        return made.elsewhere(out, settings[0], *made.KINDS)
     for kind, make in made.KINDS.items():
         make(out / kind)
     return out
-
-
-@pytest.fixture(autouse=True)
-def _few_figures() -> Any:
-    with patch("calib.report.figures.collect.plates", made.two_plates):
-        yield
-
-
-@pytest.fixture
-def report(originals: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(originals / "report", tmp_path / "report"))
 
 
 @pytest.fixture(scope="package")
@@ -73,56 +55,41 @@ def original_here(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made.report(tmp_path_factory.mktemp("original") / "here")
 
 
-@pytest.fixture
-def report_here(original_here: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(original_here, tmp_path / "here"))
-
-
-@pytest.fixture
-def whole(originals: Path, tmp_path: Path) -> Path:
-    """A report with one of the source's gaps, the audit and figures for print."""
-    return Path(shutil.copytree(originals / "whole", tmp_path / "whole"))
-
-
-@pytest.fixture(scope="package")
-def whole_original_here(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    with patch("calib.report.figures.collect.plates", made.two_plates):
-        return made.whole(tmp_path_factory.mktemp("original") / "whole_here")
-
-
-@pytest.fixture
-def whole_here(whole_original_here: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(whole_original_here, tmp_path / "whole_here"))
-
-
-@pytest.fixture
-def run(originals: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(originals / "run", tmp_path / "run"))
-
-
-@pytest.fixture
-def compared(originals: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(originals / "comparison", tmp_path / "compared"))
-
-
 @pytest.fixture(scope="package")
 def compared_original_here(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made.comparison(tmp_path_factory.mktemp("original") / "compared_here")
 
 
-@pytest.fixture
-def compared_here(compared_original_here: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(compared_original_here, tmp_path / "compared_here"))
+@pytest.fixture(scope="package")
+def whole_original_here(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made.whole(tmp_path_factory.mktemp("original") / "whole_here")
+
+
+def _copy_of(fixture: str, kind: str = "") -> Any:
+    @pytest.fixture
+    def copy(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+        original = request.getfixturevalue(fixture) / kind
+        return Path(shutil.copytree(original, tmp_path / (kind or fixture)))
+
+    return copy
+
+
+report, report_here = _copy_of("originals", "report"), _copy_of("original_here")
+# With one of the source's gaps, the audit and figures for print.
+whole, whole_here = _copy_of("originals", "whole"), _copy_of("whole_original_here")
+run = _copy_of("originals", "run")
+compared, compared_here = _copy_of("originals", "comparison"), _copy_of("compared_original_here")
+
+
+@pytest.fixture(autouse=True)
+def _few_figures() -> Any:
+    with patch("calib.report.figures.collect.plates", made.two_plates):
+        yield
 
 
 @pytest.fixture(scope="package")
 def _made(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[Any, Any], Path]:
     return {}, tmp_path_factory.mktemp("made")
-
-
-@pytest.fixture(scope="package")
-def _read() -> dict[Any, Any]:
-    return {}
 
 
 @pytest.fixture
@@ -143,65 +110,114 @@ def audited_once(_made, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def computed_once(_made, _read, audited_once, monkeypatch: pytest.MonkeyPatch) -> None:
+def computed_once(_made, audited_once, monkeypatch: pytest.MonkeyPatch) -> None:
     """Do the work of equal inputs once, and read equal posteriors once.
 
     Most tampering leaves them as they are.
     """
     cache, folder = _made
 
-    def once(key: Any, out: Path, make: Callable[[Path], Any]) -> Any:
+    def once(key: Any, make: Callable[[], Any]) -> Any:
         if key not in cache:
-            kept = folder / str(len(cache))
-            cache[key] = make(kept), kept
-        result, kept = cache[key]
+            cache[key] = make()
+        return cache[key]
+
+    def made_once(key: Any, out: Path, make: Callable[[Path], Any]) -> Any:
+        kept = folder / sha256(repr(key).encode())
+        result = once(key, lambda: make(kept))
         shutil.copytree(kept, out)
         return result
 
     def report_again(manifest, tasks, out, progress, pool):
+        own = {"files", "left_out"}  # from which nothing is computed
         key = (
-            manifest.model_dump_json(exclude={**dict.fromkeys(_OWN, True), "document": _OWN}),
+            manifest.model_dump_json(exclude={**dict.fromkeys(own, True), "document": own}),
             *(t.table[c].tobytes() for t in tasks for c in t.table),
             *(t.prior_path.read_bytes() for t in tasks),
         )
-        return once(key, out, lambda kept: recompute_report(manifest, tasks, kept, progress, pool))
+        return made_once(
+            key, out, lambda kept: recompute_report(manifest, tasks, kept, progress, pool)
+        )
 
     def run_again(record, problem, out, progress):
-        # All but its numbers that nothing is computed from.
-        said = {
-            k: v for k, v in record.document.items() if k not in ("sha256", "log_evidence", "gate")
-        }
+        unused = ("sha256", "log_evidence", "gate")
+        said = {k: v for k, v in record.document.items() if k not in unused}
         key = (json.dumps(said), *(problem.table[c].tobytes() for c in problem.table))
-        return once(key, out, lambda kept: recompute_run(record, problem, kept, progress))
+        return made_once(key, out, lambda kept: recompute_run(record, problem, kept, progress))
+
+    def diagnosed_once(case, seed, **more):
+        tables = (case.lab, case.field)
+        key = "diagnosis", seed, *(t[c].tobytes() for t in tables for c in t.columns)
+        return once(key, lambda: diagnose(case, seed, **more))
 
     def reading_once(read: Callable[[Path], Any]) -> Callable[[Path], Any]:
         def read_once(path: Path) -> Any:
-            if not path.is_file():
-                return read(path)
-            key = read, sha256(path.read_bytes())
-            if key not in _read:
-                _read[key] = read(path)
-            return _read[key]
+            return once((read, sha256(path.read_bytes())), lambda: read(path))
 
         return read_once
 
-    def errors_once(calibration: Calibration) -> dict[Any, Any]:
+    def errors_once(calibration) -> dict[Any, Any]:
+        # Kept with the calibration, whose id is no other's as long as it is there.
         key = "errors", id(calibration)
-        if key not in cache:
-            cache[key] = calibration, posterior_errors(calibration)
-        return dict(cache[key][1])
+        return dict(once(key, lambda: (calibration, posterior_errors(calibration)))[1])
 
     monkeypatch.setattr(tolerances, "posterior_errors", errors_once)
     monkeypatch.setattr(check_module, "recompute_report", report_again)
-    monkeypatch.setattr(check_module, "recompute_run", run_again)
-    for name in ("_groups", "read_draws"):
+    monkeypatch.setattr(folders, "recompute_run", run_again)
+    monkeypatch.setattr(folders, "diagnose", diagnosed_once)
+    for name in ("_variables", "read_draws"):
         monkeypatch.setattr(compare, name, reading_once(getattr(compare, name)))
 
 
-def edit_json(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+# Ways to tamper with a folder
+
+
+def edit_json(path: Path, change: Callable[[Any], object]) -> None:
     content = json.loads(path.read_text())
     change(content)
     path.write_text(json.dumps(content, indent=1) + "\n")
+
+
+def in_manifest(change: Callable[[Any], object]) -> Change:
+    return lambda folder: edit_json(folder / "manifest.json", change)
+
+
+def in_text(name: str, old: str, new: str) -> Change:
+    def change(folder: Path) -> None:
+        text = (folder / name).read_text()
+        assert old in text
+        (folder / name).write_text(text.replace(old, new, 1))
+
+    return change
+
+
+def scaled(place: str, by: float) -> Change:
+    """Multiply a number that a summary has of the rut depth."""
+    *above, last = place.split(".")
+
+    def change(summary: Any) -> None:
+        entry = summary["models"]["rut_depth"]
+        for key in above:
+            entry = entry[key]
+        entry[last] *= by
+
+    return lambda folder: edit_json(folder / "summary.json", change)
+
+
+def swap_figures(one: str, other: str, *, page: bool = False) -> Change:
+    """Exchange two figures of a folder, on its page too if that is wanted."""
+
+    def change(folder: Path) -> None:
+        first, second = ((folder / name).read_bytes() for name in (one, other))
+        (folder / one).write_bytes(second)
+        (folder / other).write_bytes(first)
+        if page:
+            shown = [base64.b64encode(content).decode() for content in (first, second)]
+            text = (folder / "index.html").read_text()
+            text = text.replace(shown[0], "<first>").replace(shown[1], shown[0])
+            (folder / "index.html").write_text(text.replace("<first>", shown[1]))
+
+    return change
 
 
 def seal(folder: Path, *, rewrite: bool = True) -> None:
@@ -209,25 +225,21 @@ def seal(folder: Path, *, rewrite: bool = True) -> None:
 
     Tables and methods are written again from the numbers as they are now, unless told otherwise.
     """
+
+    def hash_inputs(manifest: dict[str, Any]) -> None:
+        for entry in manifest["tasks"].values():
+            for kind in ("data", "priors"):
+                entry[kind]["sha256"] = sha256((folder / entry[kind]["file"]).read_bytes())
+
     if rewrite:
         with suppress(ValueError, KeyError, TypeError, AttributeError):
             manifest = json.loads((folder / "manifest.json").read_text())
+            hash_inputs(manifest)
             summary = json.loads((folder / "summary.json").read_text())
-            for name, entry in manifest["tasks"].items():
-                for kind in ("data", "priors"):
-                    path = folder / entry[kind]["file"]
-                    manifest["tasks"][name][kind]["sha256"] = sha256(path.read_bytes())
             for name, text in publication(manifest, summary).files.items():
                 (folder / name).write_text(text, encoding="utf-8")
-
-    def change(manifest: dict[str, Any]) -> None:
-        manifest["files"] = file_hashes(folder)
-        for entry in manifest["tasks"].values():
-            for kind in ("data", "priors"):
-                path = folder / entry[kind]["file"]
-                entry[kind]["sha256"] = sha256(path.read_bytes())
-
-    edit_json(folder / "manifest.json", change)
+    in_manifest(hash_inputs)(folder)
+    in_manifest(lambda m: m.update(files=file_hashes(folder)))(folder)
 
 
 def seal_run(folder: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,12 +15,16 @@ from matplotlib.figure import Figure
 
 from calib.batch.environment import sha256
 from calib.check.check import check
-from calib.check.outcome import Status
+from calib.check.compare import Status
+from calib.data import read_table
 from calib.errors import CalibError
 from calib.models import example_csv
-from calib.report.comparison import page, table
+from calib.report.comparison import StatedComparison, page, plan_comparison, table
 from calib.report.figures.style import png_bytes
-from tests.check.conftest import different, edit_json, findings, seal_run
+from calib.report.sections import work_out
+from calib.report.study import HoldOut, plan_tasks
+from calib.report.writer import file_hashes
+from tests.check.conftest import Change, different, edit_json, findings, in_manifest, seal_run
 
 from . import made
 
@@ -32,8 +37,12 @@ def seal(folder: Path) -> None:
         seal_run(run)
     found = json.loads((folder / FILE).read_text())
     (folder / "index.html").write_text(page(found, (folder / "figures/bands.png").read_bytes()))
-    edit_json(folder / FILE, lambda m: m.update(
-        files={n: sha256((folder / n).read_bytes()) for n in m["files"]}))  # fmt: skip
+    hash_again(folder)
+
+
+def hash_again(folder: Path) -> None:
+    hashes = {path: sha256(path.read_bytes()) for path in folder.rglob("*") if path.is_file()}
+    edit_json(folder / FILE, lambda m: m.update(files={n: hashes[folder / n] for n in m["files"]}))
 
 
 def test_an_untouched_comparison_is_the_same_bit_for_bit(compared_here: Path) -> None:
@@ -104,7 +113,7 @@ def test_a_comparison_is_in_the_units_of_its_file_and_checks(
     assert {i.status for i in outcome.items} == {Status.IDENTICAL}
 
 
-def of_model(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
+def of_model(change: Callable[[dict[str, Any]], object]) -> Change:
     return lambda folder: edit_json(folder / FILE, lambda m: change(m["models"]["bekker"]))
 
 
@@ -129,7 +138,7 @@ def exchange_bands(folder: Path) -> None:
 
 
 RAW = "comparison.json: models.bekker"
-QUICK: dict[str, tuple[Callable[[Path], None], str]] = {
+QUICK: dict[str, tuple[Change, str]] = {
     "a weight": (of_model(lambda m: m.update(weight=m["weight"] + 0.01)),
                  f"{RAW}.weight, as its elpd_rows give it"),
     "a difference": (of_model(lambda m: m.update(below_best=1.0)),
@@ -215,3 +224,95 @@ def test_a_record_that_makes_no_sense_cannot_be_checked(
     edit_json(compared / FILE, change)
     with pytest.raises(CalibError, match=words):
         check(compared)
+
+
+# In a report
+
+
+MODELS = ("bekker_plate", "reece")
+
+
+@pytest.fixture(scope="module")
+def untouched(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("compared")
+    (folder / "plates.csv").write_text(example_csv("reece"))
+    table = read_table(folder / "plates.csv")
+    tasks = plan_tasks([table], HoldOut("plate_width_mm", 80.0))
+    section = plan_comparison(tasks, MODELS, {})
+    found = work_out(tasks, 2019, settings=made.SETTINGS, sections=[section])
+    return made.write(found, folder / "report")
+
+
+def test_it_is_the_same_bit_for_bit_and_on_the_page(untouched: Path) -> None:
+    outcome = check(untouched)
+    assert {i.name for i in outcome.items if i.status is not Status.IDENTICAL} == set()
+    names = {item.name for item in outcome.items}
+    assert "compared/comparison.json: models.reece.held_out.crps" in names
+    assert "compared/runs/reece/posterior.nc" in names
+    stated = json.loads((untouched / "manifest.json").read_text())["comparison"]
+    page = (untouched / "index.html").read_text()
+    assert stated["verdict"] in page
+    assert 'href="compared/index.html"' in page
+    assert set(stated["models"]) == set(MODELS)
+
+
+def change_weight(m: dict[str, Any]) -> None:
+    m["comparison"]["models"]["reece"]["weight"] += 0.1
+
+
+def change_seed(folder: Path) -> None:
+    edit_json(folder / "compared/comparison.json", lambda m: m.update(seed=1))
+    edit_json(folder / "manifest.json", lambda m: m["comparison"].update(seed=1))
+
+
+def change_rows(folder: Path) -> None:
+    path = folder / "compared/held_out.csv"
+    path.write_text("\n".join(path.read_text().splitlines()[:-1]) + "\n")
+
+
+def change_header(folder: Path) -> None:
+    header = [*read_table(folder / "compared/held_out.csv").header]
+    header[header.index("rut_depth_mm")] = "rut_depth_in"
+    edit_json(folder / "compared/comparison.json", lambda m: m.update(header=header))
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (in_manifest(change_weight), "manifest.json: comparison"),
+        (change_seed, "compared/comparison.json"),
+        (change_rows, "compared/comparison.json"),
+        (change_header, "compared/comparison.json: header"),
+    ],
+)
+def test_what_does_not_belong_together_is_found(
+    untouched: Path, tmp_path: Path, change: Change, named: str
+) -> None:
+    folder = tmp_path / "report"
+    shutil.copytree(untouched, folder)
+    change(folder)
+    hash_again(folder / "compared")
+    in_manifest(lambda m: m.update(files=file_hashes(folder)))(folder)
+    outcome = check(folder, quick=True)
+    assert named in {i.name for i in outcome.items if i.status is Status.DIFFERENT}
+
+
+def test_a_folder_that_no_section_is_of_is_a_stranger(untouched: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "report"
+    shutil.copytree(untouched, folder)
+    in_manifest(lambda m: m.pop("comparison"))(folder)
+    found = {i.name for i in check(folder).items if i.status is Status.DIFFERENT}
+    assert {"compared/index.html", "index.html"} <= found
+
+
+def test_what_cannot_be_compared_in_a_report_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "plates.csv").write_text(example_csv("reece"))
+    tasks = plan_tasks([read_table(tmp_path / "plates.csv")])
+    with pytest.raises(CalibError, match="nothing to compare in reece"):
+        plan_comparison(tasks, ["reece"], {})
+    with pytest.raises(CalibError, match="predict drawbar_pull_kn, which the report does not have"):
+        plan_comparison(tasks, ["magic_formula", "wismer_luth"], {})
+    with pytest.raises(CalibError, match="slip_ratio"):
+        plan_comparison(tasks, ["reece", "lyasko"], {})
+    with pytest.raises(ValueError, match="no record"):
+        StatedComparison.again({"models": {"reece": 1}})

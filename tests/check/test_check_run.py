@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from calib.check.check import check
-from calib.check.outcome import Status
+from calib.check.compare import Status
 from calib.errors import CalibError
 from calib.inference.calibration import calibrate
 from calib.inference.io import load_calibration, save_calibration
@@ -188,7 +188,7 @@ def test_a_run_says_nothing_of_the_computer_it_was_made_on(run: Path) -> None:
         (lambda m: m.pop("settings"), "settings"),
         (lambda m: m.pop("code"), "code"),
         (lambda m: m.update(schema="calib/run/0"), "calib/run/0"),
-        (lambda m: m.update(model="pacejka"), "mend: pass the file of your own that declares it"),
+        (lambda m: m.update(model="pacejka"), "hint: pass the file of your own that declares it"),
         (lambda m: m.update(references={"p": "high"}), "references"),
     ],
 )
@@ -205,15 +205,13 @@ def test_a_record_that_makes_no_sense_cannot_be_checked(run: Path, change, words
         lambda m: m.update(references={}),
         lambda m: m.update(fixed={"nothing": 1.0}),
         lambda m: m.update(prior_text="model ="),
-        lambda m: m["estimates"][0].update(method="guess"),
-        lambda m: m["estimates"][0].update(theta=[1.0]),
+        lambda m: m["estimates"][0].update(method="guess", theta=[1.0]),
         lambda m: m["settings"].update(ensembles=0),
     ],
 )
 def test_a_record_that_cannot_be_computed_from_is_different(run: Path, change) -> None:
     edit_json(run / "run.json", change)
     assert check(run).exit_code == 1
-    assert check(run, quick=True).exit_code in (0, 1)
 
 
 def test_a_checked_run_still_predicts(run: Path) -> None:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 from scipy.stats import norm
 
-from calib.check.compare import compare_entries, flatten
-from calib.check.outcome import Status
+from calib.check.compare import Status, compare_entries, flatten
 from calib.check.tolerances import (
     drawn_in_output,
     drawn_in_run,
@@ -44,7 +43,7 @@ def test_no_false_alarm_over_the_pairs_of_many_seeds() -> None:
                 steps = old[*place, "sampling", "steps"]
                 sizes = drawn_in_output(result.calibration, result.validation, 300, steps)
                 drawn_by = {(*place, *path): size for path, size in sizes.items()}
-                items = compare_entries(old, new, lambda _: "", drawn_by)
+                items = compare_entries(old, new, drawn_by)
                 # Other seeds search otherwise: only what is drawn from posteriors is meant here.
                 drawn = [i for i in items if any(f".{part}." in i.name for part in DRAWN)]
                 compared += len(drawn)

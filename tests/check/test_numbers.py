@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calib.check.compare import compare_entries, flatten, without_numbers
-from calib.check.outcome import Item, Status
+from calib.check.compare import Item, Status, compare_entries, flatten, without_numbers
 
 FILE = "summary.json"
 POSTERIOR = (FILE, "models", "rut_depth", "posterior", "n1")
@@ -20,7 +19,7 @@ POSTERIOR = (FILE, "models", "rut_depth", "posterior", "n1")
 def compare(old: Any, new: Any, *place: str, drawn: Any = None) -> dict[str, Item]:
     """Entries by the last part of their name."""
     both = (dict(flatten(document, (FILE, *place))) for document in (old, new))
-    items = compare_entries(*both, lambda _: "g", drawn)  # type: ignore[call-arg]
+    items = compare_entries(*both, drawn)
     return {item.name.rpartition(".")[2].rpartition(" ")[2]: item for item in items}
 
 
@@ -148,5 +147,5 @@ JSON = st.recursive(
 def test_any_document_equals_its_copy(document) -> None:
     copy = json.loads(json.dumps(document))
     both = (dict(flatten(d, (FILE,))) for d in (document, copy))
-    items = compare_entries(*both, lambda _: "g")  # type: ignore[call-arg]
+    items = compare_entries(*both)
     assert all(item.status is Status.IDENTICAL for item in items)

@@ -32,7 +32,7 @@ def checked(setting: Setting) -> dict:
     return document
 
 
-@pytest.mark.parametrize("setting", FEW, ids=str)
+@pytest.mark.parametrize("setting", FEW[:1], ids=str)
 def test_the_reference_report_is_what_is_computed_again(setting: Setting) -> None:
     document = checked(setting)
     names = {item["name"] for item in document["items"]}
@@ -52,6 +52,6 @@ def test_the_reference_report_is_what_is_computed_again(setting: Setting) -> Non
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("setting", [s for s in ALL if s not in FEW[-1:]], ids=str)
+@pytest.mark.parametrize("setting", [s for s in ALL if s not in FEW[:1]], ids=str)
 def test_the_reference_report_is_the_same_on_every_processor(setting: Setting) -> None:
     checked(setting)

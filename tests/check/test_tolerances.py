@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from calib.check.compare import compare_entries, flatten, is_document
-from calib.check.outcome import Status
-from calib.check.tolerances import _PATTERNS, TABLE, tolerance_of
-from calib.check.verify import SUMMARY
-from tests.main_report import main_report
+from calib.check.compare import SUMMARY, Status, compare_entries, flatten
+from calib.check.tolerances import TABLE, compiled, tolerance_of
+from tests.gap_files import gap_files
+
+REPORT = Path(__file__).resolve().parents[2] / "reports" / "he2019"
 
 
 def entries(name: str) -> dict[tuple[str, ...], Any]:
-    text = (main_report() / "he2019" / name).read_text()
+    """Those of the committed report, or of a diagnosis that belongs into one."""
+    folder, _, file = name.rpartition("/")
+    path = gap_files(folder.partition("/")[2]) / file if folder else REPORT / name
+    text = path.read_text()
     if not name.endswith(".json"):
         header, first = (line.split(",") for line in text.splitlines()[:2])
         row = zip(header, first, strict=True)
@@ -23,23 +27,24 @@ def entries(name: str) -> dict[tuple[str, ...], Any]:
     return dict(flatten(json.loads(text), (name,)))
 
 
-def documents() -> list[str]:
-    report = main_report() / "he2019"
-    names = [p.relative_to(report).as_posix() for p in report.rglob("*") if p.is_file()]
-    return sorted(filter(is_document, names))
-
-
 def test_every_row_of_the_table_is_used() -> None:
     """By the embedded data's report, or by what a run or a comparison has."""
     # Of entries that differ by their position alone one stands for all.
     alike = {
         tuple("0" if key.isdecimal() else key for key in path)
-        for name in documents()
+        for name in (
+            SUMMARY,
+            "manifest.json",
+            "audit.json",
+            "gaps/held_out_pull/diagnosis.json",
+            DIAGNOSIS,
+            "gaps/plain_bekker/fresh_prediction.csv",
+        )
         for path in entries(name)
     }
     paths = ["/".join(path) for path in alike]
     paths += [
-        "gaps/plain_bekker/corrected.json/lab_mode/rut_depth/0",
+        "diagnosis.json/warnings/0", "gaps/plain_bekker/corrected.json/lab_mode/rut_depth/0",
         "run.json/estimates/0/cost", "run.json/estimates/0/reported/n0",
         "run.json/estimates/0/theta/1", "run.json/shape/0",
         "summary.json/models/rut_depth/sampling/reasons/0",
@@ -51,7 +56,9 @@ def test_every_row_of_the_table_is_used() -> None:
             for x in ("elpd_difference", "preferred", "sentence")
         ),
     ]  # fmt: skip
-    first = {next((i for i, (p, _) in enumerate(_PATTERNS) if p.fullmatch(x)), None) for x in paths}
+    first = {
+        next((i for i, (p, _) in enumerate(TABLE) if compiled(p).fullmatch(x)), None) for x in paths
+    }
     unused = [TABLE[i][0] for i in range(len(TABLE)) if i not in first]
     assert unused == []
 
@@ -62,11 +69,7 @@ def judged(name: str, place: tuple[str, ...], by: Any) -> Status:
     recorded = dict(found)
     old = recorded[name, *place]
     recorded[name, *place] = by if isinstance(by, str) else old + by
-    (item,) = (
-        i
-        for i in compare_entries(recorded, found, lambda _: "")
-        if i.status is not Status.IDENTICAL
-    )
+    (item,) = (i for i in compare_entries(recorded, found) if i.status is not Status.IDENTICAL)
     return item.status
 
 

@@ -1,1 +1,1 @@
-from tests.cli.test_cli import calib as run  # noqa: F401
+from tests.commands import calib  # noqa: F401

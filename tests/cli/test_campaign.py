@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from calib.cli import main
 from calib.models import example_csv
 from tests.batch.campaign.sites import refuse_all, results
+from tests.commands import Calib, Ran
 
 # Tests that run in the background of a shell inherit that Ctrl-C is ignored.
 FROM_A_TERMINAL = """
@@ -29,71 +29,65 @@ FIT = '[[fit]]\nname = "a"\ndata = ["*.csv"]\nmodels = ["bekker"]\nposteriors = 
 
 
 @pytest.fixture
-def calib(monkeypatch, capsys, tmp_path):
-    """Run the verb as the shell would, in a folder with a data file."""
-    monkeypatch.chdir(tmp_path)
+def campaign(calib: Calib) -> Calib:
+    """Run the verb on a plan, in a folder with a data file."""
     Path("rut.csv").write_text(example_csv("bekker"))
 
-    def run(plan: str, *options: str) -> tuple[int, str, str]:
+    def run(plan: str, *options: str) -> Ran:
         Path("plan.toml").write_text(plan)
-        words = ["calib", "campaign", "plan.toml", "--out", "out", "--workers", "1", *options]
-        monkeypatch.setattr(sys, "argv", words)
-        with pytest.raises(SystemExit) as ended:
-            main()
-        captured = capsys.readouterr()
-        return int(ended.value.code or 0), captured.out, captured.err
+        return calib("campaign", "plan.toml", "--out", "out", "--workers", 1, *options)
 
     return run
 
 
-def test_it_works_and_goes_on_where_it_stopped(calib):
-    code, out, _ = calib(FIT)
-    assert code == 0
-    assert out == "1 of 1 tasks done, 0 failed\nout/summary.json\n"
-    first = Path("out/results/a.rut.bekker.shipped.nothing/numbers.json").stat().st_mtime_ns
-    code, out, _ = calib(FIT + CASES.format(1))
-    assert (code, out.splitlines()[0]) == (0, "2 of 2 tasks done, 0 failed")
-    again = Path("out/results/a.rut.bekker.shipped.nothing/numbers.json").stat().st_mtime_ns
-    assert again == first
+def test_it_works_and_goes_on_where_it_stopped(campaign: Calib) -> None:
+    ran = campaign(FIT)
+    assert (ran.code, ran.out) == (0, "1 of 1 tasks done, 0 failed\nout/summary.json\n")
+    numbers = Path("out/results/a.rut.bekker.shipped.nothing/numbers.json")
+    first = numbers.stat().st_mtime_ns
+    ran = campaign(FIT + CASES.format(1))
+    assert (ran.code, ran.out.splitlines()[0]) == (0, "2 of 2 tasks done, 0 failed")
+    assert numbers.stat().st_mtime_ns == first
 
 
-def test_a_list_of_tasks_does_nothing(calib):
-    code, out, _ = calib(FIT + CASES.format(2), "--list")
-    assert code == 0
-    assert out == "a.rut.bekker.shipped.nothing\nblind.case-000\nblind.case-001\n"
+def test_a_list_of_tasks_does_nothing(campaign: Calib) -> None:
+    ran = campaign(FIT + CASES.format(2), "--list")
+    assert ran.code == 0
+    assert ran.out == "a.rut.bekker.shipped.nothing\nblind.case-000\nblind.case-001\n"
     assert not Path("out").exists()
 
 
-def test_failed_tasks_end_with_one(calib):
+def test_failed_tasks_end_with_one(campaign: Calib) -> None:
     Path("bad.csv").write_text("average_ground_pressure_kpa\n1\n")
-    code, out, err = calib(FIT)
-    assert code == 1
-    assert "1 of 2 tasks done, 1 failed" in out
-    assert "a.bad.bekker.shipped.nothing failed: bad.csv" in err
-    assert "rut_depth" in err
+    ran = campaign(FIT)
+    assert ran.code == 1
+    assert "1 of 2 tasks done, 1 failed" in ran.out
+    assert "a.bad.bekker.shipped.nothing failed: bad.csv" in ran.err
+    assert "rut_depth" in ran.err
     state = json.loads(Path("out/summary.json").read_text())["tasks"]
     assert state["a.bad.bekker.shipped.nothing"]["state"] == "failed"
 
 
-def test_posteriors_that_did_not_converge_end_with_three(calib, monkeypatch):
+def test_posteriors_that_did_not_converge_end_with_three(
+    campaign: Calib, monkeypatch: pytest.MonkeyPatch
+) -> None:
     refuse_all(monkeypatch)
-    code, out, _ = calib(FIT + "max_steps = 100\n")
-    assert code == 3
-    assert "NOT CONVERGED, not to be used: a.rut.bekker.shipped.nothing" in out
+    ran = campaign(FIT + "max_steps = 100\n")
+    assert ran.code == 3
+    assert "NOT CONVERGED, not to be used: a.rut.bekker.shipped.nothing" in ran.out
 
 
-def test_what_can_be_mended_ends_with_two(calib):
-    code, _, err = calib(FIT.replace("bekker", "becker"))
-    assert code == 2
-    assert "plan.toml, [[fit]], models: " in err
-    code, _, err = calib(FIT, "--scheduler", "nonsense")
-    assert code == 2
-    assert "no Dask scheduler" in err
-    calib(FIT)
-    code, _, err = calib("seed = 1\n" + FIT)
-    assert code == 2
-    assert "--overwrite" in err
-    assert calib("seed = 1\n" + FIT, "--overwrite")[0] == 0
+def test_what_can_be_mended_ends_with_two(campaign: Calib) -> None:
+    for plan, options, words in (
+        (FIT.replace("bekker", "becker"), (), "plan.toml, [[fit]], models: "),
+        (FIT, ("--scheduler", "nonsense"), "no Dask scheduler"),
+    ):
+        ran = campaign(plan, *options)
+        assert (ran.code, words in ran.err) == (2, True), ran.err
+    campaign(FIT)
+    ran = campaign("seed = 1\n" + FIT)
+    assert (ran.code, "--overwrite" in ran.err) == (2, True)
+    assert campaign("seed = 1\n" + FIT, "--overwrite").code == 0
 
 
 @pytest.mark.slow

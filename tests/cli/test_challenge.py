@@ -6,10 +6,10 @@ import json
 from pathlib import Path
 
 from tests.blind import BlindTest
-from tests.cli.test_cli import Calib, calib  # noqa: F401
+from tests.commands import Calib
 
 
-def test_cases_are_made_diagnosed_and_scored(calib: Calib) -> None:  # noqa: F811
+def test_cases_are_made_diagnosed_and_scored(calib: Calib) -> None:
     made = calib("challenge", "make", "--out", "cases", "--key", "sealed/key.json", "--seed", 8,
                  "--cases", 1, "--tier", "easy", "--workers", 1)  # fmt: skip
     assert made.code == 0, made.err
@@ -43,7 +43,7 @@ def test_cases_are_made_diagnosed_and_scored(calib: Calib) -> None:  # noqa: F81
 
 
 def test_cases_are_drawn_again_as_the_diagnosis_believes(
-    calib: Calib,  # noqa: F811
+    calib: Calib,
     blind_test: BlindTest,
     believed_test: BlindTest,
 ) -> None:

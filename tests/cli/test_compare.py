@@ -13,8 +13,7 @@ from calib.models import example_csv
 from calib.report.comparison import table
 from calib.report.figures.collect import plates
 from tests.browser import Browser, faults
-from tests.cli.test_cli import Calib
-from tests.cli.test_cli import calib as calib
+from tests.commands import Calib
 from tests.inference.emulation.test_emulate import as_before as as_before
 from tests.models.simulators.examples import lab, write_program
 

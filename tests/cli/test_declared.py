@@ -9,19 +9,19 @@ import pytest
 from calib.data.quantities import QUANTITIES
 from calib.gap.effects import EFFECTS
 from calib.models import MODELS
-from tests.cli.test_cli import Calib
+from tests.commands import Calib
 
 
 @pytest.mark.parametrize(
     ("what", "known"), [("models", MODELS), ("effects", EFFECTS), ("quantities", QUANTITIES)]
 )
-def test_all_are_listed_and_each_is_told(run: Calib, what: str, known: dict) -> None:
-    listed = run(what)
+def test_all_are_listed_and_each_is_told(calib: Calib, what: str, known: dict) -> None:
+    listed = calib(what)
     assert listed.code == 0
     assert all(f"{name}: " in listed.out for name in known)
-    assert list(json.loads(run(what, "--json").out)[what]) == list(known)
+    assert list(json.loads(calib(what, "--json").out)[what]) == list(known)
     for name in known:
-        told = run(what, name, "--json")
+        told = calib(what, name, "--json")
         assert told.code == 0
         assert json.loads(told.out)[what][name]["title"]
 
@@ -36,31 +36,31 @@ def test_all_are_listed_and_each_is_told(run: Calib, what: str, known: dict) -> 
     ],
 )
 def test_a_name_that_is_not_there_is_answered_by_one_like_it(
-    run: Calib, what: str, given: str, near: str
+    calib: Calib, what: str, given: str, near: str
 ) -> None:
-    refused = run(what, given)
+    refused = calib(what, given)
     assert refused.code == 2
     assert f"did you mean {near}? or name the file" in refused.err
 
 
-def test_an_effect_is_told_with_equation_needs_and_priors(run: Calib) -> None:
-    told = run("effects", "moisture_softening").out
+def test_an_effect_is_told_with_equation_needs_and_priors(calib: Calib) -> None:
+    told = calib("effects", "moisture_softening").out
     for words in ("equation: ", "The field records gravimetric_water_content.", "No formula is"):
         assert words in told
-    facts = json.loads(run("effects", "moisture_softening", "--json").out)
+    facts = json.loads(calib("effects", "moisture_softening", "--json").out)
     priors = facts["effects"]["moisture_softening"]["priors"]
     assert list(priors) == list(EFFECTS["moisture_softening"].parameters)
     assert all(p["source"] and p["why"] for p in priors.values())
 
 
-def test_a_quantity_is_found_by_whatever_a_column_may_be_called(run: Calib) -> None:
+def test_a_quantity_is_found_by_whatever_a_column_may_be_called(calib: Calib) -> None:
     for name in ("normal_load_kn", "load", "wheel_load_lbf"):
-        assert run("quantities", name).out.startswith("normal_load_kn: Normal load")
+        assert calib("quantities", name).out.startswith("normal_load_kn: Normal load")
 
 
 @pytest.mark.parametrize("what", ["models", "effects", "quantities"])
-def test_what_there_is_not_is_refused_with_what_there_is(run: Calib, what: str) -> None:
-    refused = run(what, "nothing")
+def test_what_there_is_not_is_refused_with_what_there_is(calib: Calib, what: str) -> None:
+    refused = calib(what, "nothing")
     assert refused.code == 2
     assert "there is no" in refused.err
     assert "expected: " in refused.err

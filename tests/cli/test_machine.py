@@ -16,9 +16,8 @@ import typer
 
 import calib as package
 from calib.cli.app import app
-from calib.models import MODELS, example_csv
-from tests.cli.test_cli import Calib
-from tests.cli.test_cli import calib as calib
+from calib.models import example_csv
+from tests.commands import Calib
 
 FEW = ("--max-steps", 800)
 
@@ -62,12 +61,6 @@ def test_a_prediction_prints_columns_of_numbers(calib: Calib, run: Path) -> None
     assert "1 row lies outside" in ran.err
     printed = calib("predict", run, "--at", "at.csv")
     assert printed.out.splitlines()[0].split(",") == list(found["columns"])
-
-
-def test_models_are_listed_for_programs(calib: Calib) -> None:
-    found = json.loads(calib("models", "--json").out)["models"]
-    assert set(found) == set(MODELS)
-    assert found["bekker"]["output"] == MODELS["bekker"].output
 
 
 def test_a_comparison_and_sbc_print_the_files_they_write(calib: Calib) -> None:

@@ -13,10 +13,11 @@ import pytest
 from calib.batch.environment import sha256
 from calib.cli.gap import diagnose as cli_diagnose
 from calib.gap.diagnose import diagnose
-from tests.cli.test_cli import Calib, assert_refused, calib, contents  # noqa: F401
+from tests.commands import Calib, assert_refused, contents
+from tests.gap_files import SOFT_PATCH
 
 
-def test_the_four_cases_are_written_and_can_be_diagnosed(calib: Calib) -> None:  # noqa: F811
+def test_the_four_cases_are_written_and_can_be_diagnosed(calib: Calib) -> None:
     written = calib("data", "he2019-gaps", "--out", "gaps")
     assert written.code == 0, written.err
     assert written.out.count("reconstructed from published results, not measured") == 4
@@ -34,7 +35,7 @@ def test_the_four_cases_are_written_and_can_be_diagnosed(calib: Calib) -> None: 
     assert calib("data", "he2019-gaps", "--out", "gaps", "--overwrite").code == 0
 
 
-def test_a_users_effect_that_does_not_run_is_named(calib: Calib) -> None:  # noqa: F811
+def test_a_users_effect_that_does_not_run_is_named(calib: Calib) -> None:
     assert calib("data", "he2019-gaps", "--out", "gaps").code == 0
     Path("mine.py").write_text(
         "from calib.gap.effects import Effect\n\n\nclass Wind(Effect):\n    name = 'wind'\n"
@@ -49,13 +50,13 @@ def test_a_users_effect_that_does_not_run_is_named(calib: Calib) -> None:  # noq
     assert_refused(refused, ["mine.py, effect wind, line 10", "NameError", "gust", "hint"])
 
 
-def test_the_folder_is_called_by_the_name_of_the_data(calib: Calib, tmp_path: Path) -> None:  # noqa: F811
+def test_the_folder_is_called_by_the_name_of_the_data(calib: Calib, tmp_path: Path) -> None:
     assert calib("data", "he2019").code == 0
     assert calib("data", "he2019-gaps").code == 0
     assert {p for p in contents(tmp_path) if "/" not in p} == {"he2019", "he2019-gaps"}
 
 
-def test_a_folder_that_cannot_be_made_is_said_so(calib: Calib) -> None:  # noqa: F811
+def test_a_folder_that_cannot_be_made_is_said_so(calib: Calib) -> None:
     Path("file").write_text("")
     refused = calib("data", "he2019-gaps", "--out", "file/gaps")
     assert_refused(refused, ["file/gaps", "cannot be written"])
@@ -63,7 +64,7 @@ def test_a_folder_that_cannot_be_made_is_said_so(calib: Calib) -> None:  # noqa:
 
 @pytest.mark.slow
 def test_the_report_of_the_embedded_data_has_the_section(
-    calib: Calib,  # noqa: F811
+    calib: Calib,
     monkeypatch: pytest.MonkeyPatch,
     found_gaps,
     audit,
@@ -91,35 +92,9 @@ def test_in_python_a_diagnosis_is_the_commands() -> None:
     assert inspect.signature(diagnose).parameters["seed"].default == default
 
 
-EFFECTS = '''
-import calib
-
-class SoftPatch(calib.Effect):
-    name = "soft_patch"
-    title = "the last runs were on softer ground"
-    parameters = ("deeper",)
-    outputs = ("sinkage",)
-    form = ("size",)
-    priors = """
-model = "soft_patch"
-
-[parameters.deeper]
-dist = "normal"
-mean = 0.0
-sd = 0.2
-unit = "1"
-reason = "ruts a fifth deeper"
-source = "assumed"
-"""
-
-    def on_output(self, phi, output, location, view):
-        return location + phi[:, :1] * (view.slip() > 0.15)
-'''
-
-
-def test_a_diagnosis_with_an_effect_of_ones_own_is_predicted_from_with_it(calib: Calib) -> None:  # noqa: F811
+def test_a_diagnosis_with_an_effect_of_ones_own_is_predicted_from_with_it(calib: Calib) -> None:
     assert calib("data", "he2019-gaps", "--out", "gaps").code == 0
-    Path("mine.py").write_text(EFFECTS)
+    Path("mine.py").write_text(SOFT_PATCH)
     made = calib("diagnose", "gaps/plain_bekker", "--effects", "mine.py", "--out", "found")
     assert made.code == 0, made.err
     found = json.loads(Path("found/diagnosis.json").read_text())
@@ -146,14 +121,14 @@ def test_a_diagnosis_with_an_effect_of_ones_own_is_predicted_from_with_it(calib:
     assert (without.code, "soft_patch" in without.err) in {(0, False), (2, True)}
 
 
-def test_what_is_to_be_diagnosed_has_to_be_clear(calib: Calib) -> None:  # noqa: F811
+def test_what_is_to_be_diagnosed_has_to_be_clear(calib: Calib) -> None:
     for given in ((), ("case", "--run", "run"), ("--run", "run"), ("--field", "field.csv")):
         told = calib("diagnose", *given, "--out", "found")
         assert_refused(told, ["it is not clear what to diagnose", "--run RUN together with"])
     assert not Path("found").exists()
 
 
-def test_effects_are_of_a_diagnosis_alone(calib: Calib) -> None:  # noqa: F811
+def test_effects_are_of_a_diagnosis_alone(calib: Calib) -> None:
     assert calib("template", "bekker", "--out", "ruts.csv").code == 0
     assert calib("fit", "ruts.csv", "--model", "bekker", "--out", "run").code == 0
     for option in (("--effects", "mine.py"), ("--without", "force_offset")):
@@ -161,7 +136,7 @@ def test_effects_are_of_a_diagnosis_alone(calib: Calib) -> None:  # noqa: F811
         assert_refused(told, ["there is no diagnosis, which alone has effects", "run"])
 
 
-def test_what_comes_of_reconstructed_data_says_so(calib: Calib) -> None:  # noqa: F811
+def test_what_comes_of_reconstructed_data_says_so(calib: Calib) -> None:
     said = "The data are reconstructed from published results; they are not measurements."
     assert calib("data", "he2019-gaps", "--out", "gaps").code == 0
     # A copy under another name is what it is.
@@ -187,7 +162,7 @@ def test_what_comes_of_reconstructed_data_says_so(calib: Calib) -> None:  # noqa
     assert said in calib("check", "fit").err
 
 
-def test_data_of_ones_own_are_called_nothing(calib: Calib) -> None:  # noqa: F811
+def test_data_of_ones_own_are_called_nothing(calib: Calib) -> None:
     template = calib("template", "bekker", "--out", "own.csv")
     assert template.code == 0
     assert "reconstructed" not in calib("fit", "own.csv", "--model", "bekker", "--out", "fit").err

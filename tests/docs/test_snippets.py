@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.cli.test_cli import Calib, Ran
+from tests.commands import Calib, Ran
 from tests.docs.pages import PAGES, Block, blocks
 
 BLOCKS = {page: list(blocks(path.read_text(encoding="utf-8"))) for page, path in PAGES.items()}

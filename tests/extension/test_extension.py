@@ -20,7 +20,7 @@ from calib.gap.effects import EFFECTS
 from calib.models import MODELS
 from calib.models.base import BoundModel
 from calib.report.page.template import equation
-from tests.cli.test_cli import Calib
+from tests.commands import Calib
 from tests.docs.pages import ROOT, blocks
 from tests.registered import forgotten
 

@@ -21,7 +21,7 @@ from calib.gap.case import Case
 from calib.models import MODELS
 from calib.models.simulators.declaration import SIMULATED, read_simulator
 from calib.models.simulators.simulator import Failure
-from tests.cli.test_cli import Calib
+from tests.commands import Calib
 from tests.models.simulators.examples import PRIORS, lab, pull, write_program
 from tests.registered import forgotten
 
