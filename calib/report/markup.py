@@ -32,6 +32,7 @@ from calib.report.labels import (
     unit_plain,
     unit_text,
 )
+from calib.report.numbers import RAISED, lowered
 
 _SPECIAL = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
@@ -56,16 +57,12 @@ _SIGNS = {
     "\N{NO-BREAK SPACE}": "~",
     "\N{CHECK MARK}": r"\rlap{$^{\ast}$}",
 }
-# Letters that LaTeX has by their names; it lacks those that look Latin.
-_NAMES = frozenset(
-    {
-        "ALPHA", "BETA", "GAMMA", "DELTA", "EPSILON", "ZETA", "ETA", "THETA", "IOTA", "KAPPA",
-        "MU", "NU", "XI", "PI", "RHO", "SIGMA", "TAU", "PHI", "CHI", "PSI", "OMEGA",
-    }
-)  # fmt: skip
-_CAPITALS = frozenset({"GAMMA", "DELTA", "THETA", "XI", "PI", "SIGMA", "PHI", "PSI", "OMEGA"})
-_RAISED = "\N{SUPERSCRIPT MINUS}⁰¹²³⁴⁵⁶⁷⁸⁹"
-_TO_PLAIN = str.maketrans(_RAISED, "-0123456789")
+# Greek letters that LaTeX has by their names; it lacks those that look Latin.
+_GREEK = frozenset({
+    "alpha", "beta", "gamma", "delta", "epsilon", "zeta", "eta", "theta", "iota", "kappa", "mu",
+    "nu", "xi", "pi", "rho", "sigma", "tau", "phi", "chi", "psi", "omega", "Gamma", "Delta",
+    "Theta", "Xi", "Pi", "Sigma", "Phi", "Psi", "Omega",
+})  # fmt: skip
 
 
 def escape(text: str) -> str:
@@ -74,9 +71,9 @@ def escape(text: str) -> str:
     Raised digits, signs and Greek letters become mathematics, letters that LaTeX's default encoding
     lacks lose their accents, and what is left of others is a question mark.
     """
-    raised = re.split(f"([{_RAISED}]+)", text)
+    raised = re.split(f"([{RAISED}]+)", text)
     return "".join(
-        f"$^{{{part.translate(_TO_PLAIN)}}}$" if k % 2 else "".join(map(_letter, part))
+        f"$^{{{lowered(part)}}}$" if k % 2 else "".join(map(_letter, part))
         for k, part in enumerate(raised)
     )
 
@@ -96,11 +93,8 @@ def _letter(letter: str) -> str:
 
 def _greek(letter: str) -> str | None:
     script, _, name = unicodedata.name(letter, "").partition(" LETTER ")
-    if script == "GREEK SMALL" and name in _NAMES:
-        return f"$\\{name.lower()}$"
-    if script == "GREEK CAPITAL" and name in _CAPITALS:
-        return f"$\\{name.capitalize()}$"
-    return None
+    name = {"GREEK SMALL": name.lower(), "GREEK CAPITAL": name.capitalize()}.get(script, "")
+    return f"$\\{name}$" if name in _GREEK else None
 
 
 def latex_unit(unit: str) -> str:
@@ -111,9 +105,6 @@ def latex_unit(unit: str) -> str:
 
 OWN = "calib"
 _ENTRY = re.compile(r"@(\w+)\{(\w+),\n(.*?)\n\}", re.DOTALL)
-_FIELD = re.compile(r"^  (\w+) = \{(.*)\},?$", re.MULTILINE)
-_ACCENTS = {"'": "\u0301", '"': "\u0308", "^": "\u0302", ".": "\u0307", "`": "\u0300"}
-_NAMED = 3
 
 
 @cache
@@ -124,7 +115,10 @@ def _source() -> str:
 @cache
 def entries() -> Mapping[str, Mapping[str, str]]:
     """Return the fields of every reference by its key, as BibTeX has them."""
-    return {key: dict(_FIELD.findall(body)) for _, key, body in _ENTRY.findall(_source())}
+    return {
+        key: dict(re.findall(r"^  (\w+) = \{(.*)\},?$", body, re.MULTILINE))
+        for _, key, body in _ENTRY.findall(_source())
+    }
 
 
 def bibtex(keys: Iterable[str], version: str) -> str:
@@ -162,7 +156,7 @@ def bibliography(keys: Iterable[str], version: str) -> list[str]:
 
 def _line(entry: Mapping[str, str]) -> str:
     names = [_spelled(name) for name in entry["author"].split(" and ")]
-    who = "; ".join(names[:_NAMED]) + ("; et al." if len(names) > _NAMED else "")
+    who = "; ".join(names[:3]) + ("; et al." if len(names) > 3 else "")
     number = f"({entry['number']})" if "number" in entry else ""
     pages = entry["pages"].replace("--", "\N{EN DASH}")
     where = f"doi:{entry['doi']}" if "doi" in entry else entry["url"]
@@ -175,9 +169,10 @@ def _line(entry: Mapping[str, str]) -> str:
 
 def _spelled(text: str) -> str:
     """Turn BibTeX's spelling into letters."""
+    accents = dict(zip("'\"^.`", "\u0301\u0308\u0302\u0307\u0300", strict=True))
     accented = re.sub(
         r"""\{\\(['"^.`])(\w)\}""",
-        lambda m: unicodedata.normalize("NFC", m[2] + _ACCENTS[m[1]]),
+        lambda m: unicodedata.normalize("NFC", m[2] + accents[m[1]]),
         text,
     )
     known = accented.replace(r"$\widehat{R}$", "R-hat").replace(r"\&", "&")

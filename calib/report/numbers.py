@@ -23,11 +23,7 @@ if TYPE_CHECKING:
 NOTHING = "\N{EN DASH}"
 _MINUS = "\N{MINUS SIGN}"
 TIMES = "\N{MULTIPLICATION SIGN}"
-_RAISED = "\N{SUPERSCRIPT MINUS}⁰¹²³⁴⁵⁶⁷⁸⁹"
-_SUPERSCRIPTS = str.maketrans("-0123456789", _RAISED)
-_FROM_SUPERSCRIPTS = str.maketrans(_RAISED, "-0123456789")
-# Powers of ten outside this range are written as such.
-_PLAIN = range(-3, 5)
+RAISED = "\N{SUPERSCRIPT MINUS}⁰¹²³⁴⁵⁶⁷⁸⁹"
 
 
 def finite(value: Any) -> Any:
@@ -142,8 +138,13 @@ def ascii_text(text: str) -> str:
     if text == NOTHING:
         return ""
     digits, _, power = text.partition(f"{TIMES}10")
-    exponent = f"e{int(power.translate(_FROM_SUPERSCRIPTS)):+03d}" if power else ""
+    exponent = f"e{int(lowered(power)):+03d}" if power else ""
     return digits.replace(_MINUS, "-") + exponent
+
+
+def lowered(raised: str) -> str:
+    """Return raised digits and signs as plain ones."""
+    return raised.translate(str.maketrans(RAISED, "-0123456789"))
 
 
 def ascii_number(value: float, last: int) -> str:
@@ -168,7 +169,7 @@ def _shows(value: float, last: int) -> bool:
 
 
 def _times(power: int) -> str:
-    return f"{TIMES}10{str(power).translate(_SUPERSCRIPTS)}"
+    return f"{TIMES}10{str(power).translate(str.maketrans('-0123456789', RAISED))}"
 
 
 def _exponent(value: float, digits: int) -> int:
@@ -181,7 +182,7 @@ def _power(values: tuple[float, ...], last: int) -> int:
     # Of the rounded numbers: 97 to the tens is 10 x 10, written 1.0 x 100.
     rounded = (round(Decimal(repr(float(v))), -last) for v in values)
     largest = max([last, *(v.adjusted() for v in rounded if v)])
-    return 0 if largest in _PLAIN else largest
+    return 0 if -3 <= largest <= 4 else largest
 
 
 def _rounded(value: float, last: int, power: int) -> str:
@@ -193,11 +194,6 @@ def _rounded(value: float, last: int, power: int) -> str:
     return text.lstrip("-") if zero else text.replace("-", _MINUS)
 
 
-# An interval that is this much longer on one side, or spans this factor, has no telling mean.
-_LOPSIDED = 2.0
-_DECADES = 30.0
-
-
 def skewed(s: ParameterSummary) -> bool:
     """Whether mean and sd would mislead.
 
@@ -207,7 +203,7 @@ def skewed(s: ParameterSummary) -> bool:
     near, far = sorted((s.median - s.hdi_lower, s.hdi_upper - s.median))
     low, high = sorted((abs(s.hdi_lower), abs(s.hdi_upper)))
     one_sign = s.hdi_lower * s.hdi_upper > 0.0
-    return far > _LOPSIDED * near or (one_sign and high > _DECADES * low)
+    return far > 2.0 * near or (one_sign and high > 30.0 * low)
 
 
 def end_scales(s: ParameterSummary) -> tuple[float, float]:

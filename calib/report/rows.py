@@ -16,9 +16,6 @@ from calib.report.labels import Axis, axis_of
 from calib.validation.scores import sign_changes
 from calib.validation.validate import Validation
 
-MAX_PANELS = 6
-_GRID = 100
-
 
 class Result(Protocol):
     """A calibration, and what it was validated on if anything."""
@@ -123,11 +120,11 @@ def signs_along(result: Result, residual: Array) -> tuple[int, int]:
 
 def _kept(found: list[Group]) -> list[Group]:
     """At most six: those held out first, then the most populated; of equals, spread out."""
-    if len(found) <= MAX_PANELS:
+    if len(found) <= 6:
         return found
-    held = [g for g in found if g.held][:MAX_PANELS]
+    held = [g for g in found if g.held][:6]
     others = [g for g in found if not g.held]
-    room = MAX_PANELS - len(held)
+    room = 6 - len(held)
     if len({g.size for g in others}) == 1:
         picked = np.linspace(0, len(others) - 1, room).round().astype(int).tolist()
         others = [others[i] for i in picked]
@@ -145,7 +142,7 @@ def _title(axis: Axis, low: float, high: float, held: bool) -> str:
 
 def _bins(values: Array) -> list[tuple[float, float, float]]:
     distinct, counts = np.unique(values, return_counts=True)
-    if distinct.size <= 2 * MAX_PANELS and counts.max() > 1:
+    if distinct.size <= 12 and counts.max() > 1:
         return [(float(v), float(v), float(v)) for v in distinct]
     if distinct.size <= 3:
         return [(float(v), float(v), float(v)) for v in distinct]
@@ -160,10 +157,10 @@ def grid(result: Result, group: Group) -> dict[str, Array]:
     x = x_column(result)
     everywhere = problem.table[x] if held is None else np.append(problem.table[x], held[x])
     ends = min(0.0, float(everywhere.min())) if role_of(x) == "slip" else float(everywhere.min())
-    conditions: dict[str, Array] = {x: np.linspace(ends, float(everywhere.max()), _GRID)}
+    conditions: dict[str, Array] = {x: np.linspace(ends, float(everywhere.max()), 100)}
     for name in problem.bound.model.conditions:
         if name != x:
             inside = problem.table[name][group.fitted]
             outside = np.empty(0) if held is None else held[name][group.held_out]
-            conditions[name] = np.full(_GRID, np.median(np.append(inside, outside)))
+            conditions[name] = np.full(100, np.median(np.append(inside, outside)))
     return conditions

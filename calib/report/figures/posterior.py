@@ -45,8 +45,6 @@ from calib.report.study import OutputResult
 from calib.validation.constants import FAR_SDS
 from calib.validation.scores import MOVED, PRIOR, ROLES, role
 
-MAX_PARAMETERS = 11
-
 
 def corner_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Plate:
     """Draw every pair of sampled parameters, and mark published ones."""
@@ -99,7 +97,7 @@ def corner_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Pla
 def _sampled(calibration: Calibration) -> tuple[Array, list[Prior], list[bool]]:
     """Thinned draws of the first free parameters, by their decimal logarithm where wide."""
     entries = calibration.problem.priors.entries
-    free = [i for i, p in enumerate(entries) if not p.fixed][:MAX_PARAMETERS]
+    free = [i for i, p in enumerate(entries) if not p.fixed][:11]
     natural = calibration.problem.theta(calibration.subset(4000))[:, free]
     low, high = np.quantile(natural, [0.02, 0.98], axis=0)
     wide = [bool(entries[i].log and high[j] > WIDE * low[j]) for j, i in enumerate(free)]
@@ -264,10 +262,10 @@ def _ranks(ax: Axes, values: Array, effective: float) -> None:
 
 # Point estimates
 
-_METHODS = (
-    "geometric", "genetic", "differential_evolution", "least_squares", "published_regression",
-)  # fmt: skip
-_LOOKS = {name: (MARKERS[i], CYCLE[i]) for i, name in enumerate(_METHODS)}
+_LOOKS = dict(zip(
+    ("geometric", "genetic", "differential_evolution", "least_squares", "published_regression"),
+    zip(MARKERS, CYCLE, strict=True), strict=False,
+))  # fmt: skip
 # Estimates farther off than this many posterior sds are drawn at the edge.
 _EDGE = 5.0
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import PurePath
 from typing import Any
@@ -33,13 +33,12 @@ from calib.report.verdict import Level
 from calib.validation.scores import MOVED, PRIOR
 
 # A shape beside every colour.
-MARKS: Mapping[str, str] = {
-    Level.FINE: "\N{HEAVY CHECK MARK}",
-    Level.CARE: "\N{BLACK UP-POINTING TRIANGLE}",
-    Level.NO: "\N{HEAVY BALLOT X}",
-    Level.FAILED: "\N{HEAVY BALLOT X}",
+_LOOKS: Mapping[str, tuple[str, str]] = {
+    Level.FINE: ("\N{HEAVY CHECK MARK}", "fine"),
+    Level.CARE: ("\N{BLACK UP-POINTING TRIANGLE}", "care"),
+    Level.NO: ("\N{HEAVY BALLOT X}", "no"),
+    Level.FAILED: ("\N{HEAVY BALLOT X}", "failed"),
 }
-_CLASSES = {Level.FINE: "fine", Level.CARE: "care", Level.NO: "no"}
 
 
 def cell(text: str, ticks: bool = False) -> Markup:
@@ -90,8 +89,8 @@ def section(o: Output, result: OutputResult, drawn: Drawn | None) -> dict[str, A
         "said": said,
         "fit": o.found["validation"],
         "chains": o.found["sampling"],
-        "mark": MARKS[verdict.level],
-        "tone": _CLASSES[verdict.level],
+        "mark": _LOOKS[verdict.level][0],
+        "tone": _LOOKS[verdict.level][1],
         "equation": equation(bound.model.latex, bound.model.numbers),
         "likelihood": to_html(likelihood(o)),
         "parametrisation": said(parametrisation(bound.model.parametrisation, bound.references)),
@@ -106,16 +105,6 @@ def section(o: Output, result: OutputResult, drawn: Drawn | None) -> dict[str, A
         if drawn
         else {},
     }
-
-
-_HELPERS: dict[str, Callable[..., Any]] = {
-    "html": to_html,
-    "cell": cell,
-    "emulation_words": emulation_words,
-    "file_name": lambda path: PurePath(path).name,
-    # The class of an exception says nothing to a reader of the page.
-    "reason": lambda e: re.sub(r"^(?:[A-Za-z_][\w.]*(?:Error|Exception): )+", "", e),
-}
 
 
 def render_page(
@@ -155,5 +144,12 @@ def render_page(
         more=[(s, Markup(html)) for s, html in more],
         paper=paper if paper is not None and paper.files else None,
         command=shlex.join(str(part) for part in manifest.get("command", ())),
-        failed_mark=MARKS[Level.FAILED], times=TIMES, **_HELPERS,
-    )  # fmt: skip
+        failed_mark=_LOOKS[Level.FAILED][0],
+        times=TIMES,
+        html=to_html,
+        cell=cell,
+        emulation_words=emulation_words,
+        file_name=lambda path: PurePath(path).name,
+        # The class of an exception says nothing to a reader of the page.
+        reason=lambda e: re.sub(r"^(?:[A-Za-z_][\w.]*(?:Error|Exception): )+", "", e),
+    )
