@@ -36,27 +36,19 @@ def inputs_record(case: Case, seed: int, effects: Mapping[str, bytes] | None = N
         "models": dict(case.models),
         "sha256": {key: table.sha256 for key, table in tables.items() if table is not None},
     }
-    if case.label:
-        content["data_label"] = case.label
-    if case.context:
-        content["context"] = case.context.words()
-    if case.covariates:
-        content["covariates"] = _kinds(case.covariates)
-    if case.priors:
-        content["priors"] = {name: sha256(p.read_bytes()) for name, p in case.priors.items()}
-    if effects:
-        content["effects"] = {name: sha256(found) for name, found in effects.items()}
+    optional = {
+        "data_label": case.label,
+        "context": case.context.words(),
+        "covariates": _kinds(case.covariates),
+        "priors": {name: sha256(p.read_bytes()) for name, p in case.priors.items()},
+        "effects": {name: sha256(found) for name, found in (effects or {}).items()},
+    }
+    content |= {key: value for key, value in optional.items() if value}
     return (json.dumps(content, indent=1) + "\n").encode()
 
 
 def recorded_inputs(folder: Path) -> dict[str, Any] | None:
-    """Return what a diagnosis says it is of; None where it does not say.
-
-    Parameters
-    ----------
-    folder : Path
-        Of one diagnosis.
-    """
+    """Return what a diagnosis says it is of; None where it does not say."""
     try:
         found = json.loads((folder / INPUTS).read_bytes())
     except (OSError, ValueError):
@@ -65,13 +57,7 @@ def recorded_inputs(folder: Path) -> dict[str, Any] | None:
 
 
 def case_hashes(folder: Path) -> dict[str, Any]:
-    """Return models and hashes of a case folder as they are now, as ``inputs.json`` has them.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the case. Files that cannot be read have no hash.
-    """
+    """Return models and hashes of a case folder as they are now, as ``inputs.json`` has them."""
     content, files = case_files(folder)
     hashes = {
         key: sha256(path.read_bytes())
@@ -104,51 +90,36 @@ def _kinds(covariates: Mapping[str, object]) -> dict[str, str]:
 
 
 def check_resumable(cases: Sequence[Path], out: Path, seed: int) -> None:
-    """Check that diagnoses which are there are of these cases, with this seed and version.
-
-    Raises
-    ------
-    CalibError
-        Saying which are not, and why.
-    """
-    found = _foreign(cases, out, seed)
-    if found:
-        reason, names = next(iter(found.items()))
+    """Check that diagnoses which are there are of these cases, with this seed and version."""
+    made_by = _made_by(seed)
+    found: dict[str, list[str]] = {}
+    for case in cases:
+        if (out / case.name).exists() and (reason := _foreign(case, out / case.name, made_by)):
+            found.setdefault(reason, []).append(case.name)
+    for reason, names in found.items():
+        listed = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
         raise CalibError(
-            f"{len(names)} of the diagnoses that are there {reason}: {_listed(names)}",
+            f"{len(names)} of the diagnoses that are there {reason}: {listed}",
             where=str(out),
             expected="an empty folder, or earlier diagnoses of the same cases",
             hint="choose another --out, or delete this folder",
         )
 
 
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
-
-
-def _foreign(cases: Sequence[Path], out: Path, seed: int) -> Mapping[str, list[str]]:
-    found: dict[str, list[str]] = {}
-    made_by = _made_by(seed)
-    for case in cases:
-        if not (out / case.name).exists():
-            continue
-        said = recorded_inputs(out / case.name)
-        if said is None:
-            reason = "do not say which cases they are of"
-        elif any(said.get(key) != value for key, value in case_hashes(case).items()):
-            reason = "are of other cases, or of these before their files were changed"
-        elif said.get("seed") != seed:
-            reason = f"were made with --seed {said.get('seed')}, not {seed}"
-        elif said.get("version") != made_by["version"]:
-            reason = f"were made by version {said.get('version')}, not {made_by['version']}"
-        elif said.get("code_sha256") != made_by["code_sha256"]:
-            reason = f"were made by other code or priors of version {made_by['version']}"
-        elif "effects" in said:
-            reason = "were made with effects of one's own"
-        else:
-            continue
-        found.setdefault(reason, []).append(case.name)
-    return found
+def _foreign(case: Path, done: Path, made_by: Mapping[str, Any]) -> str:
+    """Say why a diagnosis is not of a case as it would be made now; empty if it is."""
+    said, version = recorded_inputs(done), made_by["version"]
+    if said is None:
+        return "do not say which cases they are of"
+    if any(said.get(key) != value for key, value in case_hashes(case).items()):
+        return "are of other cases, or of these before their files were changed"
+    if said.get("seed") != made_by["seed"]:
+        return f"were made with --seed {said.get('seed')}, not {made_by['seed']}"
+    if said.get("version") != version:
+        return f"were made by version {said.get('version')}, not {version}"
+    if said.get("code_sha256") != made_by["code_sha256"]:
+        return f"were made by other code or priors of version {version}"
+    return "were made with effects of one's own" if "effects" in said else ""
 
 
 def _made_by(seed: int) -> dict[str, Any]:
@@ -205,7 +176,7 @@ def diagnose_cases(
     """
     check_resumable(cases, out, seed)
     outcome = run_tasks(
-        partial(_diagnose, seed=seed),
+        partial(_diagnosed, seed=seed),
         {case.name: case for case in cases},
         out,
         read=read_case,
@@ -218,7 +189,7 @@ def diagnose_cases(
     return dict(outcome.failed)
 
 
-def _diagnose(case: Case, seed: int) -> dict[str, bytes]:
+def _diagnosed(case: Case, seed: int) -> dict[str, bytes]:
     return written(diagnose(case, seed))
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,17 +17,13 @@ from calib.data.table import accepted_headers, renamed
 from calib.errors import CalibError
 from calib.gap.case import Case
 from calib.gap.constants import ASSUMED_LOAD_KN, MAX_RATIO, MIN_FIELD_ROWS
-from calib.gap.effects import Effect, View
-from calib.gap.noise import NoiseConditions, noise_conditions, noise_conditions_of_lab
+from calib.gap.effects import View
+from calib.gap.noise import Noise, NoiseConditions, noise_conditions, noise_conditions_of_lab
 from calib.inference.priors import Priors
 from calib.inference.problem import Problem, build_problem
 from calib.models import MODELS, get_model
 from calib.models.base import Array
 from calib.models.simulators.emulator import emulator_of
-
-if TYPE_CHECKING:
-    from calib.gap.discrepancy import ShiftMap
-    from calib.gap.hypotheses import ShiftAs
 
 # What something may vary with by itself, where it is not just one physical role: the first of them
 # that is recorded and varies.
@@ -38,17 +33,7 @@ _OVER = {
     "low_pressure": ("pressure",),
 }
 # Roles of which a discrepancy knows what they may do.
-_KNOWN = (
-    "slip",
-    "order",
-    "speed",
-    "passes",
-    "load",
-    "cone",
-    "ground_pressure",
-    "water_by_volume",
-    *_OVER,
-)
+_KNOWN = {"slip", "order", "speed", "passes", "load", "cone", *sum(_OVER.values(), ())}
 
 
 def columns_over(what: str) -> tuple[str, ...]:
@@ -61,50 +46,6 @@ def other_conditions(view: View) -> tuple[str, ...]:
     recorded = [QUANTITIES[c] for c in view.conditions if c in QUANTITIES]
     roles = [q.physical for q in recorded if q.role == "condition" and q.physical not in _KNOWN]
     return tuple(dict.fromkeys(roles))
-
-
-class ScaledConditions:
-    """Covariates of a pair of campaigns on a scale of -1..1."""
-
-    def __init__(self, data: Campaigns) -> None:
-        self.data = data
-        self._of_field: dict[str, Array | None] = {}
-
-    @cached_property
-    def _ranges(self) -> dict[str, Array]:
-        lab = self.data.case.lab.columns
-        return {
-            name: np.concatenate([values, lab.get(name, values)])
-            for name, values in self.data.view.conditions.items()
-        }
-
-    def over(self, view: View, what: str) -> Array | None:
-        """What something varies with (see `columns_over`), scaled, shape (n,); None if nothing."""
-        columns = (self.scaled(view, name) for name in columns_over(what))
-        return next((u for u in columns if u is not None), None)
-
-    def scaled(self, view: View, name: str) -> Array | None:
-        """A condition, or its logarithm, shape (n,); None where it is lacking or constant."""
-        if view.conditions is not self.data.view.conditions:
-            return self._scaled(view, name)
-        # The field's own, which all hypotheses ask for, are worked out once.
-        if name not in self._of_field:
-            self._of_field[name] = self._scaled(view, name)
-        return self._of_field[name]
-
-    def _scaled(self, view: View, name: str) -> Array | None:
-        if name not in view.conditions or name not in self._ranges:
-            return None  # of conditions to predict, what the campaigns do not have explains nothing
-        values, reference = view.conditions[name], self._ranges[name]
-        if name in QUANTITIES and QUANTITIES[name].of_factors:
-            values, reference = (
-                np.log(np.maximum(values, 1e-6)),
-                np.log(np.maximum(reference, 1e-6)),
-            )
-        if np.ptp(reference) < 1e-9 * max(1.0, abs(reference).max()):
-            return None
-        mid, half = 0.5 * (reference.max() + reference.min()), 0.5 * np.ptp(reference)
-        return np.clip((values - mid) / half, -1.5, 1.5)
 
 
 class CaseSimulator:
@@ -308,20 +249,34 @@ class Campaigns:
         pressures = float(recorded.min()), float(recorded.max())
         return {o.name: CaseSimulator(o, self.view, pressures) for o in self.outputs}
 
-    @cached_property
-    def covariates(self) -> ScaledConditions:
-        """Conditions scaled to the range of both campaigns."""
-        return ScaledConditions(self)
+    def scaled(self, view: View, what: str) -> Array | None:
+        """Return what something varies with, scaled to -1..1 over both campaigns.
 
-    @cached_property
-    def forms(self) -> dict[Effect, tuple[Array, list[float]]]:
-        """Bases of effects' form errors at the field's rows, kept as hypotheses need them."""
-        return {}
+        Parameters
+        ----------
+        view : View
+        what : str
+            See `columns_over`.
 
-    @cached_property
-    def shift_maps(self) -> dict[ShiftAs, tuple[ShiftMap, list[float]]]:
-        """What shifts of the parameters do, of either kind, kept as hypotheses need them."""
-        return {}
+        Returns
+        -------
+        ndarray, shape (n,), or None
+            Of speeds and the like the logarithm; None where it is lacking or constant.
+        """
+        columns = (self._scaled(view, name) for name in columns_over(what))
+        return next((u for u in columns if u is not None), None)
+
+    def _scaled(self, view: View, name: str) -> Array | None:
+        if name not in view.conditions or name not in self.view.conditions:
+            return None  # of conditions to predict, what the campaigns do not have explains nothing
+        own, lab = self.view.conditions[name], self.case.lab.columns
+        values, both = view.conditions[name], np.concatenate([own, lab.get(name, own)])
+        if name in QUANTITIES and QUANTITIES[name].of_factors:
+            values, both = np.log(np.maximum(values, 1e-6)), np.log(np.maximum(both, 1e-6))
+        if np.ptp(both) < 1e-9 * max(1.0, abs(both).max()):
+            return None
+        mid, half = 0.5 * (both.max() + both.min()), 0.5 * np.ptp(both)
+        return np.clip((values - mid) / half, -1.5, 1.5)
 
     @cached_property
     def at_rows(self) -> dict[str, NoiseConditions]:
@@ -333,6 +288,14 @@ class Campaigns:
     def observed(self) -> Array:
         """Lab rows, then field rows, of one output after the other, on the responses' scales."""
         return np.concatenate([v for o in self.outputs for v in (o.problem.response, o.field)])
+
+    def in_noise(self, change: Mapping[str, Array], noise: Mapping[str, Noise]) -> dict[str, Array]:
+        """Return changes (k, n) of each output at its field rows, in noise sds, (k, rows)."""
+        at = noise_conditions(self.view)
+        return {
+            o.name: change[o.name][:, o.rows] / noise[o.name].sd(at.rows(o.rows))
+            for o in self.outputs
+        }
 
     def at(self, table: Table) -> View:
         """Return the view of other conditions, with the same references."""
@@ -441,13 +404,18 @@ def _check_field(case: Case, name: str, column: str, rows: NDArray[np.int64]) ->
             hint=f"measure more, or take {name} out of the case",
         )
     lab, field = (float(np.nanmedian(np.abs(t[column]))) for t in (case.lab, case.field))
-    unit = QUANTITIES[column].unit
+    check_ratio(case, column, lab, field, "outputs")
+
+
+def check_ratio(case: Case, column: str, lab: float, field: float, kind: str) -> None:
+    """Refuse campaigns whose typical values of a column cannot be in the same unit."""
+    quantity = QUANTITIES[column]
     if not 1.0 / MAX_RATIO < field / max(lab, 1e-300) < MAX_RATIO:
         raise CalibError(
-            f"{QUANTITIES[column].word} is typically {plain_number(field)} {unit} in the field and "
-            f"{plain_number(lab)} {unit} in the calibration",
+            f"{quantity.word} is typically {plain_number(field)} {quantity.unit} in the field and "
+            f"{plain_number(lab)} {quantity.unit} in the calibration",
             where=f"{case.field.source}, column {case.field.header_of(column)!r}",
-            expected=f"campaigns whose outputs differ by less than a factor of {MAX_RATIO:g}",
+            expected=f"campaigns whose {kind} differ by less than a factor of {MAX_RATIO:g}",
             hint="check the units in the column names",
         )
 

@@ -227,20 +227,7 @@ def _read_file(path: Path) -> CaseFile:
 
 
 def read_context(content: Any, where: str) -> Context:
-    """Check the table ``[context]`` of a ``case.toml``.
-
-    Parameters
-    ----------
-    content : Any
-        The table, or None where there is none.
-    where : str
-        Its file, for messages.
-
-    Raises
-    ------
-    CalibError
-        Naming the entry, and what is allowed there.
-    """
+    """Check the table ``[context]`` of a ``case.toml``."""
     try:
         context = Context.model_validate({} if content is None else content)
     except ValidationError as error:
@@ -360,20 +347,7 @@ def case_from_run(run: Path, field: Path) -> Case:
 def declared_covariates(
     content: Mapping[str, str | Sequence[str]], tables: Sequence[Table]
 ) -> dict[str, tuple[str, ...]]:
-    """Return the declared columns and the values of each category; none for numbers.
-
-    Parameters
-    ----------
-    content : mapping of str to (str or sequence of str)
-        The table ``[covariates]``: "number", "category", or the values of a category.
-    tables : sequence of Table
-        In which every column must be.
-
-    Raises
-    ------
-    CalibError
-        If it declares a known quantity, a column that is not there, or neither kind.
-    """
+    """Return the declared columns and the values of each category; none for numbers."""
     found: dict[str, tuple[str, ...]] = {}
     for name, kind in content.items():
         if _is_known(name):
@@ -398,13 +372,7 @@ def declared_covariates(
 
 
 def with_declared(table: Table, covariates: Mapping[str, tuple[str, ...]]) -> Table:
-    """Add declared columns to a table: numbers as they are, categories as their place in the list.
-
-    Raises
-    ------
-    CalibError
-        If one is not there, or holds something else.
-    """
+    """Add declared columns to a table: numbers, and categories as their place in the list."""
     if not covariates:
         return table
     added = {name: _codes(table, name, levels) for name, levels in covariates.items()}

@@ -389,15 +389,7 @@ class NewPrediction:
 
 
 def predict_new(truth: Truth, before: Mapping[str, Array]) -> dict[str, NewPrediction]:
-    """Predict with the calibrated simulator and with the corrected one.
-
-    Parameters
-    ----------
-    truth : Truth
-        At the new conditions.
-    before : mapping of str to ndarray, shape (n,)
-        The simulator as it was calibrated in the lab.
-    """
+    """Predict with the calibrated simulator and with the corrected one."""
     return {
         name: NewPrediction(
             before[name],

@@ -62,19 +62,7 @@ class _File(BaseModel):
 
 
 def another_soil() -> dict[str, tuple[Array, float]]:
-    """Read how quantities move together when the soil is another one.
-
-    Returns
-    -------
-    dict
-        Quantity to its loadings on the ways in which soils differ, shape (ways,), and the sd of
-        what it does by itself; in units of the prior sds.
-
-    Raises
-    ------
-    CalibError
-        If the prior file cannot be read or is not complete.
-    """
+    """Read how quantities move together when the soil is another one."""
     path = default_priors("shifts/another_soil")
     try:
         file = _File.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
@@ -138,16 +126,6 @@ def shift_map(outputs: Sequence[OutputData], shift_as: ShiftAs) -> tuple[ShiftMa
     Slip was zeroed in the laboratory, where the wheel pulled nothing. Elsewhere it pulls nothing at
     another slip, for the resistance differs: the recorded slip is then wrong as with a wrong
     rolling radius. It is sought where drawbar pull is measured.
-
-    Parameters
-    ----------
-    shift_as : {"alone", "soil"}
-
-    Returns
-    -------
-    ShiftMap
-    list of float
-        Prior sds of the coordinates for shifts of one prior sd.
     """
     at = coordinates(outputs)
     kinds = [kind for _, kind in at]
@@ -196,10 +174,6 @@ def _together(kinds: Sequence[str], alone: Array) -> Array:
 THRESHOLDS = (-0.85, 0.9)
 
 
-# Basis (n, m) and the sds of its coefficients (m,), by what they depend on.
-type Bases = dict[tuple[str, str, float, str | None], tuple[Array, Array]]
-
-
 class Discrepancy:
     """What a hypothesis's free discrepancy may look like on a pair of campaigns.
 
@@ -208,8 +182,6 @@ class Discrepancy:
     lab_mode : mapping of str to ndarray
         Internal parameters of the simulators as the lab calibrated them; for a discrepancy that
         varies with the level of the output.
-    bases : dict, optional
-        Where to keep what other discrepancies of the same case and `lab_mode` share.
     """
 
     def __init__(
@@ -217,18 +189,13 @@ class Discrepancy:
         data: Campaigns,
         hypothesis: Hypothesis,
         lab_mode: Mapping[str, Array],
-        bases: Bases | None = None,
     ) -> None:
         self.data, self.hypothesis = data, hypothesis
-        self.covariates, self.lab_mode = data.covariates, lab_mode
+        self.lab_mode = lab_mode
         # Worked out once for the field rows, which every step of a fit predicts.
-        h, bases = hypothesis, {} if bases is None else bases
-        self._of_field: dict[str, tuple[Array, Array]] = {}
-        for name in h.smooth_outputs:
-            key = (name, h.smooth_over, h.smooth_decay, h.onset_over)
-            if key not in bases:
-                bases[key] = self._smooth_basis(data.view, name)
-            self._of_field[name] = bases[key]
+        self._of_field = {
+            name: self._smooth_basis(data.view, name) for name in hypothesis.smooth_outputs
+        }
 
     def sds(self, output: str) -> Array:
         """Relative prior sds of an output's amplitudes, shape (m,)."""
@@ -272,7 +239,7 @@ class Discrepancy:
         over = self.hypothesis.onset_over or ""
         if over in ("level", "sinkage"):
             return self._known(self._level(view, self._level_of(over, output)))
-        u = self._known(self.covariates.over(view, over))
+        u = self._known(self.data.scaled(view, over))
         return -u if over == "low_pressure" else u
 
     def _known(self, u: Array | None) -> Array:
@@ -293,7 +260,7 @@ class Discrepancy:
         if over in ("level", "sinkage"):
             terms = self._cosines(self._level(view, self._level_of(over, output)), 8, 0.8)
         elif over == "order":
-            terms = self._cosines(self.covariates.over(view, "order"), 12, 0.7)
+            terms = self._cosines(self.data.scaled(view, "order"), 12, 0.7)
         elif over == "ripple":
             terms = self._ripples(view)
         elif over in SETTINGS or over in other_conditions(self.data.view):
@@ -305,17 +272,17 @@ class Discrepancy:
         return np.stack(basis, axis=1), np.array([1.0] + [w for _, w in terms])
 
     def _condition_terms(self, view: View, *, everything: bool) -> list[tuple[Array, float]]:
-        slip = self.covariates.over(view, "slip")
+        slip = self.data.scaled(view, "slip")
         slips = self._cosines(slip, 10, 0.7)
         terms = list(slips)
         if everything:
-            terms += self._cosines(self.covariates.over(view, "order"), 6, 0.5)
+            terms += self._cosines(self.data.scaled(view, "order"), 6, 0.5)
         bends = 2 if everything else 1
         for u, sd in self._cosines(*self._settings(view, "pressure", bends), 0.5):
             terms.append((u, sd))
             terms += [(u * b, sd * w) for b, w in slips[:4]]
         for name in ("speed", "passes", "water", "load", "cone", *other_conditions(view)):
-            values = self.covariates.over(view, name)
+            values = self.data.scaled(view, name)
             if values is not None and everything:
                 terms += self._cosines(values, 3, 0.4)
                 if slip is not None:
@@ -333,13 +300,13 @@ class Discrepancy:
 
     def _settings(self, view: View, over: str, most: int) -> tuple[Array | None, int]:
         """A condition, and how many cosines of it its values in the field can tell apart."""
-        reference = self.covariates.over(self.data.view, over)
+        reference = self.data.scaled(self.data.view, over)
         values = 1 if reference is None else np.unique(reference).size
-        return self.covariates.over(view, over), min(values - 1, most)
+        return self.data.scaled(view, over), min(values - 1, most)
 
     def _ripples(self, view: View) -> list[tuple[Array, float]]:
         """Waves over the slips, none more probable than another, of rms 1 in all."""
-        slip = self.covariates.over(view, "slip")
+        slip = self.data.scaled(view, "slip")
         each = (2 * RIPPLES) ** -0.5
         return [(basis, each) for basis, _ in self._cosines(slip, 2 * RIPPLES, 1.0)]
 

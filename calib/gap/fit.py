@@ -99,7 +99,7 @@ def truncated_fits(starts: Sequence[Start]) -> list[list[Fit]]:
     """Take the first Gauss-Newton steps of fits on the same campaigns."""
     problems = [Residuals(start.forward.data, start.forward) for start in starts]
     asked = [(p, p.clip(start.guesses)) for p, start in zip(problems, starts, strict=True)]
-    ascents = []
+    iterates = []
     for start, (problem, psi), raw in zip(starts, asked, residuals_of_all(asked), strict=True):
         costs = problem.costs(psi, raw, problem.sds(start.noise))
         begun = problem.best(costs, psi, start.count)
@@ -107,8 +107,8 @@ def truncated_fits(starts: Sequence[Start]) -> list[list[Fit]]:
         linear = forward.smooth_slices and not forward.hypothesis.effects and forward.shift is None
         # Predictions are linear in a discrepancy: its noise is known after the second step.
         steps = 2 if linear else FIRST_STEPS
-        ascents.append([Iterate(problem, psi[i], raw[i], noise, steps) for i in begun])
-    return _climbed(ascents)
+        iterates.append([Iterate(problem, psi[i], raw[i], noise, steps) for i in begun])
+    return _climbed(iterates)
 
 
 def fit(forward: Forward, start: Array, noise: Mapping[str, Noise]) -> Fit:
@@ -153,49 +153,49 @@ def full_fits(begun: Sequence[Sequence[Fit]]) -> list[list[Fit]]:
     )
 
 
-def _climbed(ascents: Sequence[Sequence[Iterate]]) -> list[list[Fit]]:
+def _climbed(iterates: Sequence[Sequence[Iterate]]) -> list[list[Fit]]:
     """Climb from guesses at several hypotheses to the modes beside them."""
-    everyone = [a for group in ascents for a in group]
+    everyone = [a for group in iterates for a in group]
     gauss_newton(everyone)
     found: dict[Iterate, Fit] = {}
-    for stack in batches(everyone):
-        found |= zip(stack.ascents, _laplace(stack, slopes(stack, stack.kept())), strict=True)
-    return [[found[a] for a in group] for group in ascents]
+    for batch in batches(everyone):
+        found |= zip(batch.iterates, _laplace(batch, slopes(batch, batch.kept())), strict=True)
+    return [[found[a] for a in group] for group in iterates]
 
 
-def _laplace(stack: Batch, slope: Slope) -> list[Fit]:
+def _laplace(batch: Batch, slope: Slope) -> list[Fit]:
     """The normals about modes, and the evidence that they give."""
     # A flat direction is as wide as its prior.
-    flat = np.where(stack.precision > 0, 0.0, 1.0 / stack.width**2) * 1e-6
+    flat = np.where(batch.precision > 0, 0.0, 1.0 / batch.width**2) * 1e-6
     hessian = slope.hessian + diagonal(flat)
     sign, log_det = np.linalg.slogdet(hessian)
     inverse = np.linalg.inv(hessian)
-    residual = stack.raw / slope.sds
+    residual = batch.raw / slope.sds
     log_likelihood = -0.5 * (
         np.square(residual).sum(axis=1)
         + 2.0 * np.log(slope.sds).sum(axis=1)
         + residual.shape[1] * np.log(2.0 * np.pi)
     )
-    left, at = variance_left(slope.scaled, inverse), stack.data.at_rows
+    left, at = variance_left(slope.scaled, inverse), batch.data.at_rows
     averaging = np.sum(
-        [ln_averaging(stack.raw[:, p], left[:, p], at[o]) for o, p in stack.parts.items()], axis=0
+        [ln_averaging(batch.raw[:, p], left[:, p], at[o]) for o, p in batch.parts.items()], axis=0
     )
-    n_lab = {o.name: o.problem.response.size for o in stack.data.outputs}
+    n_lab = {o.name: o.problem.response.size for o in batch.data.outputs}
     fits = []
-    for i, ascent in enumerate(stack.ascents):
-        problem, psi, d = ascent.problem, ascent.psi, ascent.psi.size
+    for i, iterate in enumerate(batch.iterates):
+        problem, psi, d = iterate.problem, iterate.psi, iterate.psi.size
         covariance = inverse[i, :d, :d]
         evidence = float(log_likelihood[i] + problem.forward.priors.log_prob(psi[None])[0])
         evidence += 0.5 * d * np.log(2.0 * np.pi) - 0.5 * float(log_det[i])
         evidence += _bounds_correction(problem, psi, slope.gradient[i, :d], covariance)
-        evidence += sum(ln_prior(n) for n in ascent.noise.values()) + float(averaging[i])
-        field = {o: residual[i, part][n_lab[o] :] for o, part in stack.parts.items()}
+        evidence += sum(ln_prior(n) for n in iterate.noise.values()) + float(averaging[i])
+        field = {o: residual[i, part][n_lab[o] :] for o, part in batch.parts.items()}
         fits.append(
             Fit(
                 problem.forward,
                 psi,
                 _within(problem, covariance),
-                ascent.noise,
+                iterate.noise,
                 evidence if np.isfinite(evidence) and sign[i] > 0 else -np.inf,
                 float(log_likelihood[i]),
                 field,

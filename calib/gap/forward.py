@@ -14,10 +14,9 @@ What hypotheses add to the simulators' predictions: their effects, form errors, 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +24,7 @@ from numpy.typing import NDArray
 from calib.data.quantities import columns_of
 from calib.gap.campaigns import Campaigns
 from calib.gap.constants import FORM_ERROR, MISFIT
-from calib.gap.discrepancy import THRESHOLDS, Bases, Discrepancy, ShiftMap, shift_map
+from calib.gap.discrepancy import THRESHOLDS, Discrepancy, ShiftMap, shift_map
 from calib.gap.effects import Effect, View
 from calib.gap.hypotheses import Hypothesis
 from calib.inference.priors import Prior, Priors
@@ -33,38 +32,14 @@ from calib.models.base import Array
 
 # Effects to leave out, by their place, of those asked for, by their place.
 type LeftOut = Mapping[int, Collection[int]]
-_NONE: LeftOut = {}
 type _Rows = slice | NDArray[np.int64]
-# Rows of the predictions, which they are of those of an effect, and what it adds in them.
-type _Added = tuple[_Rows, slice | NDArray[np.bool_], Array]
-
-
-def field_predictions(
-    asked: Sequence[tuple[Forward, Array]],
-    view: View,
-    plain: dict[str, Array],
-    idle: LeftOut = _NONE,
-) -> dict[str, Array]:
-    """Add to what simulators predict what hypotheses on the same campaigns say.
-
-    An effect is asked once for all hypotheses that have it: of few rows at a time asking takes
-    longer than the arithmetic.
-
-    Parameters
-    ----------
-    asked : sequence of (Forward, ndarray)
-        With psi of each, shape (k, d); one below the other they are the rows of `plain`.
-    plain : dict of str to ndarray, shape (sum of k, n)
-    idle : mapping of int to collection of int
-        Effects to leave out of one of those asked, by their place.
-    """
-    return FieldPrediction(asked, view, plain, idle).at([psi for _, psi in asked])
 
 
 class FieldPrediction:
-    """What `field_predictions` adds, with form errors that may be others later.
+    """Field rows under hypotheses on the same campaigns, with form errors that may change later.
 
-    The conditions that truly held do not depend on these: simulators are asked once.
+    An effect is evaluated once for all hypotheses that have it: for few rows at a time a call takes
+    longer than its arithmetic. The conditions that truly held do not depend on the form errors.
     """
 
     @np.errstate(all="ignore")
@@ -73,7 +48,7 @@ class FieldPrediction:
         asked: Sequence[tuple[Forward, Array]],
         view: View,
         plain: dict[str, Array],
-        idle: LeftOut = _NONE,
+        idle: LeftOut | None = None,
     ) -> None:
         self._view, self._plain = view, plain
         ends = np.cumsum([len(psi) for _, psi in asked]).tolist()
@@ -81,8 +56,8 @@ class FieldPrediction:
             (forward, slice(end - len(psi), end))
             for (forward, psi), end in zip(asked, ends, strict=True)
         ]
-        self._acting = _acting(self._parts, [psi for _, psi in asked], view, plain, idle)
-        self._added: dict[str, list[list[_Added]]] = {}
+        self._acting = _acting(self._parts, [psi for _, psi in asked], view, plain, idle or {})
+        self._added: dict[str, list[Array | None]] = {}
         if self._acting:
             forward = asked[0][0]
             shared = np.concatenate([psi[:, : forward.n_shared] for _, psi in asked])
@@ -151,18 +126,6 @@ class _Acting:
     phi: Array
     view: View
 
-    def apart(self, moved: NDArray[np.int64]) -> Iterator[tuple[int, _Rows, Any, Array, View]]:
-        """Part the rows by what was moved there before: that, rows, which, phi and view."""
-        before = moved[self.rows]
-        if before.size and (before == before[0]).all():
-            yield int(before[0]), self.rows, slice(None), self.phi, self.view
-            return
-        places = np.arange(moved.size)[self.rows]
-        for mask in np.unique(before).tolist():
-            some = before == mask
-            view = _seen(self.view, self.view.base, some)
-            yield mask, places[some], some, self.phi[some], view
-
 
 def _acting(
     parts: Sequence[tuple[Forward, slice]],
@@ -202,47 +165,40 @@ def _added(
     view: View,
     acting: Sequence[_Acting],
     plain: Array,
-) -> list[list[_Added]]:
+) -> list[Array | None]:
     """What each effect adds to one output by the conditions that truly held, by its formula."""
     role, simulated = forward.roles[name], forward.simulated[name]
     t, misfit = shared[:, forward.theta_slices[name]], shared[:, forward.misfit_slices[name]]
     recorded = simulated.conditions(view)
     conditions = {known: recorded[column] for known, column in simulated.columns.items()}
-    bits = {known: 1 << i for i, known in enumerate(conditions)}
     truly: dict[str, Array] = {}
-    # Which conditions are no longer the recorded ones; with those a simulator has less to do.
-    moved = np.zeros(len(plain), dtype=np.int64)
-    ahead = plain
-    added: list[list[_Added]] = []
+    ahead = plain.copy()
+    added: list[Array | None] = []
     for a in acting:
-        added.append([])
+        added.append(None)
         if role not in a.effect.outputs:
             continue
-        for mask, rows, some, phi, seen in a.apart(moved):
-            given = {
-                known: truly[known][rows] if mask & bits[known] else values
-                for known, values in conditions.items()
-            }
-            found = a.effect.on_conditions(phi, role, given, seen)
-            if found is given:
-                continue
-            there = simulated.predict_beyond(
-                t[rows], misfit[rows], {simulated.columns[known]: v for known, v in found.items()}
-            )
-            added[-1].append((rows, some, there - ahead[rows]))
-            if ahead is plain:
-                ahead = plain.copy()
-            ahead[rows] = there
-            for known in (known for known, values in found.items() if values is not given[known]):
+        given = {
+            known: truly[known][a.rows] if known in truly else values
+            for known, values in conditions.items()
+        }
+        found = a.effect.on_conditions(a.phi, role, given, a.view)
+        if found is given:
+            continue
+        at = {simulated.columns[known]: values for known, values in found.items()}
+        there = simulated.predict_beyond(t[a.rows], misfit[a.rows], at)
+        added[-1] = there - ahead[a.rows]
+        ahead[a.rows] = there
+        for known, values in found.items():
+            if values is not given[known]:
                 if known not in truly:
-                    truly[known] = np.empty(plain.shape)
-                truly[known][rows] = found[known]
-                moved[rows] |= bits[known]
+                    truly[known] = np.tile(conditions[known], (len(plain), 1))
+                truly[known][a.rows] = values
     return added
 
 
 def _changed(
-    plain: Array, role: str, acting: Sequence[tuple[_Acting, Array, Sequence[_Added]]]
+    plain: Array, role: str, acting: Sequence[tuple[_Acting, Array, Array | None]]
 ) -> Array:
     """One output with effects in it, each with its factors and what it adds by conditions.
 
@@ -250,9 +206,9 @@ def _changed(
     of its own.
     """
     mean = plain.copy()
-    for _, factor, added in acting:
-        for rows, some, change in added:
-            mean[rows] += change * factor[some]
+    for a, factor, added in acting:
+        if added is not None:
+            mean[a.rows] += added * factor
     for a, factor, _ in acting:
         here = mean[a.rows]
         changed = a.effect.on_output(a.phi, role, here, a.view)
@@ -266,7 +222,7 @@ def _changed(
     return mean
 
 
-def _seen(view: View, base: Mapping[str, Array], rows: _Rows | NDArray[np.bool_]) -> View:
+def _seen(view: View, base: Mapping[str, Array], rows: _Rows) -> View:
     """What an effect can see of some rows of what simulators predict."""
     return view.with_base({role: values[rows] for role, values in base.items()})
 
@@ -288,8 +244,6 @@ class Forward:
         varies with the level of the output.
     shift : ShiftMap, optional
         What the coordinates of a shift do, as `shift_map` once gave.
-    bases : dict, optional
-        Where to keep what free discrepancies of the same case and `lab_mode` share.
     """
 
     def __init__(
@@ -299,7 +253,6 @@ class Forward:
         noise: Mapping[str, float],
         lab_mode: Mapping[str, Array] | None = None,
         shift: ShiftMap | None = None,
-        bases: Bases | None = None,
     ) -> None:
         self.data = data
         self.hypothesis = hypothesis
@@ -320,9 +273,8 @@ class Forward:
             _append(entries, _named(e.name, p))
             for e, p in zip(hypothesis.effects, hypothesis.effect_priors, strict=True)
         ]
-        self.covariates = data.covariates
-        self.discrepancy = Discrepancy(data, hypothesis, lab_mode or {}, bases)
-        forms = [self._form_of_field(e) for e in hypothesis.effects]
+        self.discrepancy = Discrepancy(data, hypothesis, lab_mode or {})
+        forms = [self._form_basis(e, data.view) for e in hypothesis.effects]
         self._field_form = [basis for basis, _ in forms]
         # Of each effect in each output that it touches; elsewhere it has none.
         self.form_slices: dict[str, list[slice]] = {
@@ -338,10 +290,7 @@ class Forward:
         self.shift_slice = slice(len(entries), len(entries))
         self.shift: ShiftMap | None = None
         if hypothesis.shift > 0.0:
-            kind, kept = hypothesis.shift_as, data.shift_maps
-            if kind not in kept:
-                kept[kind] = shift_map(data.outputs, kind)
-            current, relative = kept[kind]
+            current, relative = shift_map(data.outputs, hypothesis.shift_as)
             self.shift = current if shift is None else shift
             shifts = [_normal("field.shift", hypothesis.shift * sd) for sd in relative]
             self.shift_slice = _append(entries, shifts)
@@ -374,25 +323,18 @@ class Forward:
             return self._field_form
         return [self._form_basis(e, view)[0] for e in self.hypothesis.effects]
 
-    def _form_of_field(self, effect: Effect) -> tuple[Array, list[float]]:
-        """What `_form_basis` gives for the field's rows, worked out once for all hypotheses."""
-        kept = self.data.forms
-        if effect not in kept:
-            kept[effect] = self._form_basis(effect, self.data.view)
-        return kept[effect]
-
     def _form_basis(self, effect: Effect, view: View) -> tuple[Array, list[float]]:
         """Basis of an effect's form error, shape (n, m), and the sds of its coefficients."""
         n = view.slip().size
         basis: list[tuple[str, Array]] = []
         if "size" in effect.form:
             basis.append(("size", np.ones(n)))
-        slip = self.covariates.over(view, "slip")
+        slip = self.data.scaled(view, "slip")
         if "slip" in effect.form and slip is not None:
             basis += [("slip", slip), ("bend", 1.5 * slip**2 - 0.5)]
         for kind in ("pressure", "extrapolation", "cone", "water"):
             over = "pressure" if kind == "extrapolation" else kind
-            values = self.covariates.over(view, over) if kind in effect.form else None
+            values = self.data.scaled(view, over) if kind in effect.form else None
             if values is not None:
                 basis.append((kind, values))
         values = effect.shape(view) if "shape" in effect.form else None
@@ -434,7 +376,7 @@ class Forward:
         if self.shift is not None:
             return self.lab(psi), self.field(psi, self.data.view)
         lab, plain = self.plain(psi)
-        return lab, self.departed(psi, self.data.view, plain)
+        return lab, fields_of_all([(self, psi)], self.data.view, plain)
 
     @_SILENT
     def plain(self, psi: Array) -> tuple[dict[str, Array], dict[str, Array]]:
@@ -478,10 +420,6 @@ class Forward:
         plain = {} if self.shift is not None else self.simulator(psi, view)
         return fields_of_all([(self, rest)], view, plain, {0: idle})
 
-    def departed(self, psi: Array, view: View, plain: dict[str, Array]) -> dict[str, Array]:
-        """Add effects and discrepancies to what simulators predict."""
-        return field_predictions([(self, psi)], view, plain)
-
     @_SILENT
     def field_and_plain(self, psi: Array, view: View) -> tuple[dict[str, Array], dict[str, Array]]:
         """Predict as `field` and as `simulator` do."""
@@ -494,33 +432,34 @@ def fields_of_all(
     asked: Sequence[tuple[Forward, Array]],
     view: View,
     plain: dict[str, Array],
-    idle: LeftOut = _NONE,
+    idle: LeftOut | None = None,
 ) -> dict[str, Array]:
-    """Predict field rows under hypotheses on the same campaigns, as `field_predictions` does.
-
-    Simulators of those with a shift are at other parameters than in `plain`.
-    """
-    shifted = [part for part in asked if part[0].shift is not None]
-    if not shifted:
-        return field_predictions(asked, view, plain, idle)
-    there = _shifted_of_all(shifted, view)
-    if len(shifted) < len(asked):
-        of_it = np.concatenate([np.full(len(psi), f.shift is not None) for f, psi in asked])
-        plain = {name: values.copy() for name, values in plain.items()}
-        for name, values in there.items():
-            plain[name][of_it] = values
-        there = plain
-    return field_predictions(asked, view, there, idle)
-
-
-def _shifted_of_all(asked: Sequence[tuple[Forward, Array]], view: View) -> dict[str, Array]:
-    """Predict field rows with the simulators at the shifted parameters of hypotheses.
+    """Predict field rows under hypotheses on the same campaigns.
 
     Parameters
     ----------
     asked : sequence of (Forward, ndarray)
-        On the same campaigns, each with a shift, and psi of each, shape (k, d).
+        With psi of each, shape (k, d).
+    plain : dict of str to ndarray, shape (sum of k, n)
+        What the simulators predict there; those with a shift are evaluated anew.
+    idle : mapping of int to collection of int, optional
+        Effects to leave out, by their place, of one of those asked, by its place.
     """
+    shifted = [part for part in asked if part[0].shift is not None]
+    if shifted:
+        there = _shifted_of_all(shifted, view)
+        if len(shifted) < len(asked):
+            of_it = np.concatenate([np.full(len(psi), f.shift is not None) for f, psi in asked])
+            plain = {name: values.copy() for name, values in plain.items()}
+            for name, values in there.items():
+                plain[name][of_it] = values
+        else:
+            plain = there
+    return FieldPrediction(asked, view, plain, idle).at([psi for _, psi in asked])
+
+
+def _shifted_of_all(asked: Sequence[tuple[Forward, Array]], view: View) -> dict[str, Array]:
+    """Predict field rows with the simulators at the shifted parameters of hypotheses."""
     some, _ = asked[0]
     shared = np.concatenate([psi[:, : some.n_shared] for _, psi in asked])
     shifts = [(f.shift, psi[:, f.shift_slice]) for f, psi in asked if f.shift is not None]
@@ -552,18 +491,8 @@ def _append(entries: list[Prior], new: Sequence[Prior]) -> slice:
 
 
 def _uniform(name: str, lower: float, upper: float) -> Prior:
-    return Prior(
-        name,
-        "1",
-        "",
-        "",
-        f"uniform({lower:g}, {upper:g})",
-        False,
-        0.5 * (lower + upper),
-        np.inf,
-        lower,
-        upper,
-    )
+    said, middle = f"uniform({lower:g}, {upper:g})", 0.5 * (lower + upper)
+    return Prior(name, "1", "", "", said, False, middle, np.inf, lower, upper)
 
 
 @lru_cache(maxsize=256)

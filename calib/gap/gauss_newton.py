@@ -1,15 +1,13 @@
-"""Climb to modes of hypotheses' posteriors: Gauss-Newton from several guesses in step.
+"""Modes of hypotheses' posteriors by Gauss-Newton steps from several starting points at once.
 
-The simulator costs as much for one vector of parameters as for a hundred, and of matrices as small
-as these the overhead of an operation is most of its cost. All guesses at all hypotheses take their
-steps together: a climb is a generator that asks for residuals.
-
-Residuals of both campaigns as functions of a hypothesis's parameters psi, many psi at once.
+The simulator costs as much for one vector of parameters as for a hundred, and for matrices as small
+as these the overhead of an operation is most of its cost: several iterates take their steps
+together, whichever hypothesis they belong to.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
@@ -110,14 +108,7 @@ class Coordinates:
         return np.where(psi + step > self.upper, -step, step)
 
     def update_noises(self, raw: Array, left: Array) -> list[dict[str, Noise]]:
-        """Noise scales that maximise the marginal likelihood, parameters allowed for.
-
-        Parameters
-        ----------
-        raw : ndarray, shape (m, N)
-        left : ndarray, shape (m, N)
-            The part of the variance of each that the parameters did not take up.
-        """
+        """Noise scales that maximise the marginal likelihood, parameters allowed for."""
         at = self.data.at_rows
         squared = np.square(raw) / left
         found = [most_probable(squared[:, part], at[o]) for o, part in self.parts.items()]
@@ -236,45 +227,10 @@ def _batched(asked: Sequence[tuple[Residuals, Array]], batch: list[int]) -> dict
     return dict(zip(batch, np.split(raw, ends[:-1]), strict=True))
 
 
-# Asks for problems' residuals at some psi (k, d), is sent them (k, N), until it has a result.
-type Requests[T] = Generator[list[tuple[Residuals, Array]], list[Array], T]
-
-# An ascent with so few nats to gain, and noise that changes by so little, is a step from its mode.
-# One that keeps gaining nothing of what its slope promises, at a kink or a bound, ends as well.
-_BESIDE, _NOTHING, _SETTLED = 1e-2, 1e-3, 1e-2
 # Steps of a truncated fit, which is not ended before.
 FIRST_STEPS = 3
 # What is taken of coordinates that one hypothesis lacks and others have: nothing depends on them.
 _LACKING = {"loc": 0.0, "precision": 1.0, "width": 1.0, "lower": -np.inf, "upper": np.inf}
-
-
-def run_in_step[T](walks: Sequence[Requests[T]]) -> list[T]:
-    """Run walks on the same campaigns in step and return their results."""
-    results: dict[int, T] = {}
-    asked: dict[int, list[tuple[Residuals, Array]]] = {}
-    for i, walk in enumerate(walks):
-        _go_on(i, walk, None, asked, results)
-    while asked:
-        found = iter(residuals_of_all([each for some in asked.values() for each in some]))
-        answers = {i: [next(found) for _ in some] for i, some in asked.items()}
-        asked = {}
-        for i, raw in answers.items():
-            _go_on(i, walks[i], raw, asked, results)
-    return [results[i] for i in range(len(walks))]
-
-
-def _go_on[T](
-    i: int,
-    walk: Requests[T],
-    raw: list[Array] | None,
-    asked: dict[int, list[tuple[Residuals, Array]]],
-    results: dict[int, T],
-) -> None:
-    """Send one walk what it asked for; keep its next question or its result."""
-    try:
-        asked[i] = next(walk) if raw is None else walk.send(raw)
-    except StopIteration as end:
-        results[i] = end.value
 
 
 @dataclass(eq=False)
@@ -305,7 +261,7 @@ class Iterate:
 
 
 class Batch(Coordinates):
-    """Where ascents stand, in arrays as wide as that of the most coordinates, D.
+    """Where iterates stand, in arrays as wide as that of the most coordinates, D.
 
     Attributes
     ----------
@@ -314,17 +270,17 @@ class Batch(Coordinates):
     dampings : ndarray, shape (m, 1)
     """
 
-    def __init__(self, ascents: Sequence[Iterate]) -> None:
-        super().__init__(ascents[0].problem.data)
-        self.ascents = ascents
+    def __init__(self, iterates: Sequence[Iterate]) -> None:
+        super().__init__(iterates[0].problem.data)
+        self.iterates = iterates
         for name, value in _LACKING.items():
-            setattr(self, name, _wide([getattr(a.problem, name) for a in ascents], value))
-        self.psi = _wide([a.psi for a in ascents], 0.0)
-        self.raw = np.stack([a.raw for a in ascents])
-        self.dampings = np.array([[a.damping] for a in ascents])
+            setattr(self, name, _wide([getattr(a.problem, name) for a in iterates], value))
+        self.psi = _wide([a.psi for a in iterates], 0.0)
+        self.raw = np.stack([a.raw for a in iterates])
+        self.dampings = np.array([[a.damping] for a in iterates])
         self._parts: list[tuple[Residuals, slice]] = []
         start = 0
-        for problem, some in groupby(a.problem for a in ascents):
+        for problem, some in groupby(a.problem for a in iterates):
             end = start + len(list(some))
             self._parts.append((problem, slice(start, end)))
             start = end
@@ -332,8 +288,8 @@ class Batch(Coordinates):
     def kept(self) -> Array:
         """Derivatives where the last step of each began, shape (m, D, N)."""
         found = np.zeros((*self.psi.shape, self.raw.shape[1]))
-        for wide, ascent in zip(found, self.ascents, strict=True):
-            wide[: ascent.psi.size] = ascent.jacobian
+        for wide, iterate in zip(found, self.iterates, strict=True):
+            wide[: iterate.psi.size] = iterate.jacobian
         return found
 
     @property
@@ -344,19 +300,17 @@ class Batch(Coordinates):
             setattr(other, name, getattr(self, name)[:, None])
         return other
 
-    def residuals(self, points: Array) -> Requests[Array]:
+    def residuals(self, points: Array) -> Array:
         """Evaluate at several points of each, shapes (m, t, D) to (m, t, N)."""
         asked = [(p, points[rows, :, : p.loc.size]) for p, rows in self._parts]
-        answers = yield [(p, some.reshape(-1, p.loc.size)) for p, some in asked]
-        return np.concatenate([a.reshape(-1, points.shape[1], a.shape[1]) for a in answers])
+        found = residuals_of_all([(p, some.reshape(-1, p.loc.size)) for p, some in asked])
+        return np.concatenate([a.reshape(-1, points.shape[1], a.shape[1]) for a in found])
 
-    def derivatives(self) -> Requests[Array]:
+    def derivatives(self) -> Array:
         """Derivatives of the residuals where each stands, shape (m, D, N)."""
         points = self.around(self.psi).reshape(*self.psi.shape, -1)
-        answers = yield [
-            (p, points[rows, p.curved, : p.loc.size].reshape(-1, p.loc.size))
-            for p, rows in self._parts
-        ]
+        asked = [(p, points[rows, p.curved, : p.loc.size]) for p, rows in self._parts]
+        answers = residuals_of_all([(p, some.reshape(-1, p.loc.size)) for p, some in asked])
         moved = np.repeat(self.raw[:, None], points.shape[1], axis=1)
         for (p, rows), answer in zip(self._parts, answers, strict=True):
             moved[rows, p.curved] = answer.reshape(-1, p.curved.size, answer.shape[1])
@@ -367,9 +321,9 @@ class Batch(Coordinates):
         return found
 
 
-def batches(ascents: Sequence[Iterate]) -> list[Batch]:
-    """Stacks of ascents of about as many coordinates."""
-    alike = sorted(ascents, key=lambda a: a.psi.size)
+def batches(iterates: Sequence[Iterate]) -> list[Batch]:
+    """Batches of iterates of about as many coordinates."""
+    alike = sorted(iterates, key=lambda a: a.psi.size)
     return [Batch(list(some)) for some in batched(alike, 16)]
 
 
@@ -383,7 +337,7 @@ def _wide(rows: Sequence[Array], value: float) -> Array:
 
 @dataclass(frozen=True)
 class Slope:
-    """Derivatives of ascents where they stand.
+    """Derivatives of iterates where they stand.
 
     Parameters
     ----------
@@ -411,85 +365,87 @@ class Slope:
         return variance_left(self.scaled, np.linalg.inv(self.hessian + diagonal(self.flat)))
 
 
-def gauss_newton(ascents: Sequence[Iterate]) -> None:
-    """Climb from guesses to the modes beside them; the ascents are moved in place."""
-    going = ascents
+def gauss_newton(iterates: Sequence[Iterate]) -> None:
+    """Climb from guesses to the modes beside them; the iterates are moved in place."""
+    going = iterates
     while going := [a for a in going if a.steps and a.quiet < 2]:
-        run_in_step([_advance(stack) for stack in batches(going)])
+        for batch in batches(going):
+            _advance(batch)
 
 
-def _advance(stack: Batch) -> Requests[None]:
+def _advance(batch: Batch) -> None:
     """One step of each."""
-    ascents = stack.ascents
-    jacobian = yield from stack.derivatives()
-    for ascent, own in zip(ascents, jacobian, strict=True):
-        ascent.jacobian = own[: ascent.psi.size]
-    slope = slopes(stack, jacobian)
-    _end_beside_modes(stack, slope)
-    gains = yield from _step(stack, slope)
-    raw = np.stack([a.raw for a in ascents])
-    noises = stack.update_noises(raw, slope.left)
-    for ascent, gained, noise in zip(ascents, gains, noises, strict=True):
-        quiet = gained < _NOTHING and _change(ascent.noise, noise) < _SETTLED
-        ascent.noise, ascent.quiet = noise, ascent.quiet + 1 if quiet else 0
-        ascent.steps -= 1
+    iterates = batch.iterates
+    jacobian = batch.derivatives()
+    for iterate, own in zip(iterates, jacobian, strict=True):
+        iterate.jacobian = own[: iterate.psi.size]
+    slope = slopes(batch, jacobian)
+    _end_beside_modes(batch, slope)
+    gains = _step(batch, slope)
+    raw = np.stack([a.raw for a in iterates])
+    noises = batch.update_noises(raw, slope.left)
+    for iterate, gained, noise in zip(iterates, gains, noises, strict=True):
+        # At a kink or a bound nothing is gained of what the slope promises: that ends as well.
+        quiet = gained < 1e-3 and _change(iterate.noise, noise) < 1e-2
+        iterate.noise, iterate.quiet = noise, iterate.quiet + 1 if quiet else 0
+        iterate.steps -= 1
 
 
-def _end_beside_modes(stack: Batch, slope: Slope) -> None:
-    """Leave ascents that are beside their modes one more step."""
-    if all(a.steps <= FIRST_STEPS for a in stack.ascents):
+def _end_beside_modes(batch: Batch, slope: Slope) -> None:
+    """Leave iterates that are beside their modes one more step."""
+    if all(a.steps <= FIRST_STEPS for a in batch.iterates):
         return
-    left = _left_to_gain(stack, slope)
-    if not (left < _BESIDE).any():
+    left = _left_to_gain(batch, slope)
+    if not (left < 1e-2).any():
         return
-    noises = stack.update_noises(stack.raw, slope.left)
-    for ascent, nats, noise in zip(stack.ascents, left.tolist(), noises, strict=True):
-        if nats < _BESIDE and _change(ascent.noise, noise) < _SETTLED:
-            ascent.steps = 1
+    noises = batch.update_noises(batch.raw, slope.left)
+    for iterate, nats, noise in zip(batch.iterates, left.tolist(), noises, strict=True):
+        if nats < 1e-2 and _change(iterate.noise, noise) < 1e-2:
+            iterate.steps = 1
 
 
-def slopes(stack: Batch, jacobian: Array) -> Slope:
-    """Slope and curvature of ascents where they stand, by derivatives, shape (m, d, N)."""
-    sds = np.stack([a.problem.sds(a.noise) for a in stack.ascents])
+def slopes(batch: Batch, jacobian: Array) -> Slope:
+    """Slope and curvature of iterates where they stand, by derivatives, shape (m, d, N)."""
+    sds = np.stack([a.problem.sds(a.noise) for a in batch.iterates])
     scaled = jacobian / sds[:, None]
     with np.errstate(invalid="ignore", over="ignore"):
-        gradient = (scaled @ (stack.raw / sds)[:, :, None])[..., 0]
-        gradient += (stack.psi - stack.loc) * stack.precision**2
+        gradient = (scaled @ (batch.raw / sds)[:, :, None])[..., 0]
+        gradient += (batch.psi - batch.loc) * batch.precision**2
         hessian = scaled @ scaled.swapaxes(1, 2)
-    hessian += diagonal(stack.precision**2)
-    return Slope(sds, scaled, gradient, hessian, 1e-6 / stack.width**2)
+    hessian += diagonal(batch.precision**2)
+    return Slope(sds, scaled, gradient, hessian, 1e-6 / batch.width**2)
 
 
-def _step(stack: Batch, slope: Slope) -> Requests[list[float]]:
+def _step(batch: Batch, slope: Slope) -> list[float]:
     """One Levenberg-Marquardt step of each: several dampings tried in one batched call.
 
     Returns what each gained; without a step the next dampings are larger.
     """
-    psi, each = stack.psi, stack.each
-    dampings = stack.dampings * np.array([0.1, 10.0, 1000.0])
-    tried = each.clip(psi[:, None] + _directions(stack, psi, slope, dampings))
-    there = yield from stack.residuals(tried)
-    cost = stack.costs(psi, stack.raw, slope.sds)
+    psi, each = batch.psi, batch.each
+    dampings = batch.dampings * np.array([0.1, 10.0, 1000.0])
+    tried = each.clip(psi[:, None] + _directions(batch, psi, slope, dampings))
+    there = batch.residuals(tried)
+    cost = batch.costs(psi, batch.raw, slope.sds)
     costs = each.costs(tried, there, slope.sds[:, None])
     costs = np.where(np.isfinite(costs), costs, np.inf)
     gains = []
     for i, best in enumerate(costs.argmin(axis=1).tolist()):
-        ascent, better = stack.ascents[i], bool(costs[i, best] < cost[i])
+        iterate, better = batch.iterates[i], bool(costs[i, best] < cost[i])
         if better:
-            ascent.psi, ascent.raw = tried[i, best, : ascent.psi.size], there[i, best]
-            ascent.damping = max(float(dampings[i, best]), 1e-9)
+            iterate.psi, iterate.raw = tried[i, best, : iterate.psi.size], there[i, best]
+            iterate.damping = max(float(dampings[i, best]), 1e-9)
         else:
-            ascent.damping = min(float(dampings[i, -1]) * 10.0, 1e6)
+            iterate.damping = min(float(dampings[i, -1]) * 10.0, 1e6)
         gains.append(float(cost[i] - costs[i, best]) if better else 0.0)
     return gains
 
 
-def _directions(stack: Coordinates, psi: Array, slope: Slope, dampings: Array) -> Array:
+def _directions(batch: Coordinates, psi: Array, slope: Slope, dampings: Array) -> Array:
     """Damped steps, shape (m, dampings, D)."""
     # A coordinate that nothing depends on at this point still needs a finite step.
-    size = np.diagonal(slope.hessian, axis1=1, axis2=2) + 1e-2 / stack.width**2
+    size = np.diagonal(slope.hessian, axis1=1, axis2=2) + 1e-2 / batch.width**2
     # At a bound, a coordinate that would leave is held there.
-    free = ~stack.blocked(psi, -slope.gradient)
+    free = ~batch.blocked(psi, -slope.gradient)
     hessian = slope.hessian * (free[:, :, None] & free[:, None])
     added = np.where(free[:, None], dampings[..., None] * size[:, None], 1.0)
     gradient = np.where(free, slope.gradient, 0.0)
@@ -498,9 +454,9 @@ def _directions(stack: Coordinates, psi: Array, slope: Slope, dampings: Array) -
     return np.asarray(-np.linalg.solve(damped, gradient[:, None, :, None])[..., 0])
 
 
-def _left_to_gain(stack: Batch, slope: Slope) -> Array:
+def _left_to_gain(batch: Batch, slope: Slope) -> Array:
     """What a whole step would gain in nats, if all were linear, shape (m,)."""
-    step = _directions(stack, stack.psi, slope, np.full((len(stack.psi), 1), 1e-9))[:, 0]
+    step = _directions(batch, batch.psi, slope, np.full((len(batch.psi), 1), 1e-9))[:, 0]
     return np.asarray(-0.5 * (step * slope.gradient).sum(axis=1))
 
 

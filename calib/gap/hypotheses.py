@@ -328,15 +328,7 @@ def with_residual_discrepancy(data: Campaigns, causes: Hypothesis) -> list[Hypot
 
 
 def resized(causes: Hypothesis, usual: Mapping[str, Priors], large: Collection[str]) -> Hypothesis:
-    """Return effects of which some may be several times as large as priors say, the others not.
-
-    Parameters
-    ----------
-    usual : mapping of str to Priors
-        Of each effect, by name.
-    large : collection of str
-        Effects that may be larger than their usual priors say.
-    """
+    """Return effects of which some may be several times as large as priors say, the others not."""
     names = [e.name for e in causes.effects]
     were = sum(p != usual[n] for n, p in zip(names, causes.effect_priors, strict=True))
     priors = tuple(_wide(usual[n]) if n in large else usual[n] for n in names)
@@ -383,13 +375,7 @@ def joined(*causes: Hypothesis) -> Hypothesis:
 
 
 def with_known_size(single: Hypothesis, context: Context) -> Hypothesis:
-    """Return an effect with what a context says of its size in the place of its prior.
-
-    Raises
-    ------
-    CalibError
-        If it has no such parameter, or the mean is not within the bounds of its prior.
-    """
+    """Return an effect with what a context says of its size in the place of its prior."""
     known = context.sizes.get(single.name)
     if not known:
         return single
@@ -430,13 +416,7 @@ def _known(effect: str, p: Prior, size: Size) -> Prior:
 
 
 def unusual_sizes(single: Sequence[Hypothesis], context: Context) -> list[str]:
-    """Say which known sizes are far from the usual ones, as in another unit.
-
-    Parameters
-    ----------
-    single : sequence of Hypothesis
-        Effects by themselves, with their usual priors.
-    """
+    """Say which known sizes are far from the usual ones, as in another unit."""
     units = parameter_units(single)
     said = []
     for h in single:

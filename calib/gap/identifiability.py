@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from calib.data.quantities import QUANTITIES, role_of
 from calib.gap.campaigns import Campaigns
@@ -28,8 +29,6 @@ from calib.gap.noise import Noise, noise_conditions
 from calib.inference.mode import hessian_scale, prior_widths
 from calib.inference.random import generator
 from calib.models.base import Array
-
-_NOTHING = 1e-6  # noise sds
 
 
 @dataclass(frozen=True)
@@ -78,7 +77,7 @@ def identifiability(
     """
     root = _metric_root(data, lab_mode, noise)
     raw = {h.name: _signatures(data, h, lab_mode, noise, seed) for h in single}
-    idle = tuple(name for name, g in raw.items() if not (np.abs(g) > _NOTHING).any())
+    idle = tuple(name for name, g in raw.items() if not (np.abs(g) > 1e-6).any())
     raw = {name: g for name, g in raw.items() if name not in idle}
     left = {name: g @ root.T for name, g in raw.items()}
     rows = [o.rows.size for o in data.outputs]
@@ -87,7 +86,7 @@ def identifiability(
     absorbed, detectable = {}, {}
     for name, g in raw.items():
         total = np.square(g).sum(axis=1)
-        seen = total > _NOTHING**2
+        seen = total > 1e-12
         kept = np.square(left[name]).sum(axis=1)
         absorbed[name] = 1.0 - float(np.median((kept / np.maximum(total, 1e-300))[seen]))
         parts = np.split(np.square(g), np.cumsum(rows)[:-1], axis=1)
@@ -102,20 +101,6 @@ def smallest_shown(prior: Array, sd: float, ln_odds: float) -> float:
 
     An effect counts from `calib.gap.odds.MIN_EFFECT_SIZE` on, so its evidence is that of a prior
     without smaller sizes.
-
-    Parameters
-    ----------
-    prior : ndarray, shape (draws,)
-        Sizes that are believable beforehand, in noise sds.
-    sd : float
-        Of the estimate of the size.
-    ln_odds : float
-        What the logarithm of the Bayes factor against no effect has to reach.
-
-    Returns
-    -------
-    float
-        Infinite if no size that is believable will do.
     """
     relevant = prior[prior >= MIN_EFFECT_SIZE]
     if not relevant.size:
@@ -169,14 +154,9 @@ def _signatures(
     psi = forward.priors.sample(generator(seed, "gap", "isolability", h.name), 512)
     for o in data.outputs:
         psi[:, forward.theta_slices[o.name]] = lab_mode[o.name]
-    plain = forward.simulator(psi, data.view)
-    full = forward.departed(psi, data.view, plain)
-    at = noise_conditions(data.view)
-    parts = [
-        (full[o.name] - plain[o.name])[:, o.rows] / noise[o.name].sd(at.rows(o.rows))
-        for o in data.outputs
-    ]
-    g = np.concatenate(parts, axis=1)
+    full, plain = forward.field_and_plain(psi, data.view)
+    change = {name: full[name] - plain[name] for name in full}
+    g = np.hstack([*data.in_noise(change, noise).values()])
     return g[np.isfinite(g).all(axis=1)]
 
 
@@ -194,21 +174,13 @@ def _metric_root(
         step = 1e-4 * width[:-1]
         points = lab_mode[o.name] + np.concatenate([np.diag(step), -np.diag(step)])
         conditions = o.problem.bound.model.select(data.view.conditions)
-        location = o.problem.bound.mean_response(o.priors.to_natural(points), conditions)[:, o.rows]
-        d = step.size
-        sensitivity = ((location[:d] - location[d:]) / (2.0 * step[:, None])).T
-        sensitivity = np.nan_to_num(sensitivity) / noise[o.name].sd(
-            noise_conditions(data.view).rows(o.rows)
-        ).reshape(-1, 1)
+        mean = o.problem.bound.mean_response(o.priors.to_natural(points), conditions)[:, o.rows]
+        change = (mean[: step.size] - mean[step.size :]) / (2.0 * step[:, None])
+        sd = noise[o.name].sd(noise_conditions(data.view).rows(o.rows))
+        sensitivity = (np.nan_to_num(change) / sd).T
         c = np.eye(o.rows.size) + sensitivity @ covariance @ sensitivity.T
         blocks.append(np.linalg.inv(np.linalg.cholesky(c)))
-    total = sum(b.shape[0] for b in blocks)
-    root = np.zeros((total, total))
-    start = 0
-    for b in blocks:
-        root[start : start + b.shape[0], start : start + b.shape[0]] = b
-        start += b.shape[0]
-    return root
+    return np.asarray(block_diag(*blocks))
 
 
 @dataclass(frozen=True)
@@ -280,13 +252,13 @@ def _moments(data: Campaigns, fit: Fit, view: View, seed: int) -> dict[str, tupl
     """Predictive mean and variance of each output on the scale of the response, (n,) each."""
     psi = fit.draws(generator(seed, "gap", "moments", fit.forward.hypothesis.name), 200)
     with np.errstate(all="ignore"):
-        location = fit.forward.field(psi, view)
+        mean = fit.forward.field(psi, view)
     found = {}
     for o in data.outputs:
         noise = fit.noise[o.name].sd(noise_conditions(view))
         found[o.name] = (
-            np.nanmean(location[o.name], axis=0),
-            np.nanvar(location[o.name], axis=0) + noise**2,
+            np.nanmean(mean[o.name], axis=0),
+            np.nanvar(mean[o.name], axis=0) + noise**2,
         )
     return found
 

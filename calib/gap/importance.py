@@ -239,18 +239,7 @@ class Density:
 
 
 def refine(fit: Fit, seed: int, plenty: int = PLENTY) -> Fit:
-    """Return a fit with draws of its posterior and the evidence that they give.
-
-    Parameters
-    ----------
-    plenty : int, optional
-        Effective draws that end the rounds.
-
-    Returns
-    -------
-    Fit
-        The same fit where too few draws carry the weight.
-    """
+    """Return a fit with draws of its posterior and the evidence that they give."""
     h = fit.forward.hypothesis
     rng = generator(
         seed, "gap", "refine", h.name, h.smooth_over, h.onset_over or "", *h.smooth_outputs

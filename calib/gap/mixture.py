@@ -89,14 +89,11 @@ class Mixture:
             for i, (fit, probability) in enumerate(zip(self.fits, self.probability, strict=True))
         ]
         weight = np.concatenate([part.weight for part in parts])
-        names = self.data.names
-        return Truth(
-            {n: np.concatenate([part.simulator[n] for part in parts]) for n in names},
-            {n: np.concatenate([part.truth[n] for part in parts]) for n in names},
-            {n: np.concatenate([part.noise[n] for part in parts]) for n in names},
-            {n: np.concatenate([part.measured[n] for part in parts]) for n in names},
-            weight / weight.sum(),
-        )
+        draws = [
+            {n: np.concatenate([getattr(part, kind)[n] for part in parts]) for n in self.data.names}
+            for kind in ("simulator", "truth", "noise", "measured")
+        ]
+        return Truth(*draws, weight / weight.sum())
 
     def _part(
         self,
@@ -122,12 +119,12 @@ class Mixture:
             good &= np.isfinite(plain[o.name]).all(axis=1) & np.isfinite(full[o.name]).all(axis=1)
         simulator, truth, noise, measured = {}, {}, {}, {}
         for o in self.data.outputs:
-            bound, location = o.problem.bound, full[o.name][good]
-            sd = fit.noise[o.name].sd(noise_conditions(view)) * np.ones_like(location)
+            bound, mean = o.problem.bound, full[o.name][good]
+            sd = fit.noise[o.name].sd(noise_conditions(view)) * np.ones_like(mean)
             simulator[o.name] = bound.from_response(plain[o.name][good])
-            truth[o.name] = bound.from_response(location)
+            truth[o.name] = bound.from_response(mean)
             noise[o.name] = sd * truth[o.name] if bound.model.response == "log" else sd
-            measured[o.name] = bound.from_response(location + sd * rng.standard_normal(sd.shape))
+            measured[o.name] = bound.from_response(mean + sd * rng.standard_normal(sd.shape))
         n = int(good.sum())
         return Truth(simulator, truth, noise, measured, np.full(n, probability / max(n, 1)))
 
@@ -247,15 +244,7 @@ def row_gaps(
 
 
 def unused_rows(data: Campaigns, field: Table) -> dict[str, dict[int, str]]:
-    """Return the field rows that an output was not judged by, with the reason.
-
-    Parameters
-    ----------
-    data : Campaigns
-        Without what was set aside.
-    field : Table
-        The campaign as it was read.
-    """
+    """Return the field rows that an output was not judged by, with the reason."""
     kept = data.case.field
     moved = np.any(
         [kept[n] != values for n, values in field.columns.items() if n not in OUTPUTS.values()],
@@ -400,13 +389,7 @@ class Inclusion:
 
 
 def inclusion_probability(probability: Mapping[str, float]) -> dict[str, float]:
-    """Return for every cause that is a part of some explanation how probable it is to act.
-
-    Parameters
-    ----------
-    probability : mapping of str to float
-        Of each explanation, by the names of its causes joined by ``+``.
-    """
+    """Return for every cause that is a part of some explanation how probable it is to act."""
     found: dict[str, float] = {}
     for name, p in probability.items():
         for cause in name.split("+"):
@@ -458,16 +441,13 @@ def _shares(mixed: Mixture, names: list[str]) -> tuple[Array, Array]:
 
 def _sizes(data: Campaigns, fit: Fit, psi: Array) -> Array:
     """Rms of what goes with each cause over all field rows, in noise sds, shape (k, causes)."""
-    forward, at = fit.forward, noise_conditions(data.view)
+    forward = fit.forward
     full = forward.field(psi, data.view)
     columns = []
     for cause in forward.causes:
         other = forward.without(psi, data.view, cause)
-        gone = [
-            (full[o.name] - other[o.name])[:, o.rows] / fit.noise[o.name].sd(at.rows(o.rows))
-            for o in data.outputs
-        ]
-        columns.append(np.sqrt(np.square(np.concatenate(gone, axis=1)).mean(axis=1)))
+        gone = data.in_noise({name: full[name] - other[name] for name in full}, fit.noise)
+        columns.append(np.sqrt(np.square(np.hstack([*gone.values()])).mean(axis=1)))
     return np.stack(columns, axis=1)
 
 

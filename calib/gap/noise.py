@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,16 +42,9 @@ class NoiseConditions:
         return growth, np.log(growth).sum(axis=2)
 
     def growth(self, rho: float, kappa: float) -> Array:
-        """Growth of the noise, shape (n,); a fit asks for the same few a thousand times."""
-        known = self._known
-        if (rho, kappa) not in known:
-            with_slip = 1.0 + rho * np.maximum(self.slip, 0.0)
-            known[rho, kappa] = with_slip * np.exp(kappa * self.softness)
-        return known[rho, kappa]
-
-    @cached_property
-    def _known(self) -> dict[tuple[float, float], Array]:
-        return {}
+        """Growth of the noise, shape (n,)."""
+        with_slip = 1.0 + rho * np.maximum(self.slip, 0.0)
+        return np.asarray(with_slip * np.exp(kappa * self.softness))
 
     def rows(self, rows: NDArray[np.int64]) -> NoiseConditions:
         """Some of the rows."""
@@ -101,27 +94,12 @@ def _at(conditions: Mapping[str, Array], lab: Mapping[str, float], size: int) ->
 
 def ln_prior(noise: Noise) -> float:
     """Log prior probability of how a noise grows."""
-    return _ln_prior(noise.rho, noise.kappa)
-
-
-@lru_cache(maxsize=1024)
-def _ln_prior(rho: float, kappa: float) -> float:
-    at_rho, at_kappa = np.argmin(np.abs(RHO - rho)), np.argmin(np.abs(KAPPA - kappa))
-    return float(LN_RHO_PRIOR[at_rho] + LN_KAPPA_PRIOR[at_kappa])
+    rho, kappa = np.argmin(np.abs(RHO - noise.rho)), np.argmin(np.abs(KAPPA - noise.kappa))
+    return float(LN_RHO_PRIOR[rho] + LN_KAPPA_PRIOR[kappa])
 
 
 def most_probable(squared: Array, at: NoiseConditions) -> list[Noise]:
-    """Maximise likelihood times prior over the grids of rho and kappa, sigma in closed form.
-
-    Parameters
-    ----------
-    squared : ndarray, shape (m, n)
-        Squares of the residuals, of m guesses.
-
-    Returns
-    -------
-    list of Noise, length m
-    """
+    """Return the most probable noise of each row of squared residuals (m, n), on the grid."""
     value, variance = _profile(squared, at)
     kappas = value.shape[1] // RHO.size
     best = value.argmax(axis=1).tolist()
@@ -136,20 +114,11 @@ def most_probable(squared: Array, at: NoiseConditions) -> list[Noise]:
 
 
 def ln_averaged(squared: Array, at: NoiseConditions) -> Array:
-    """Log of the density of residuals, averaged over how large the noise is and how it grows.
+    """Log density of squared residuals (m, n), averaged over the noise and its growth, (m,).
 
     Over rho and kappa by their prior, over ln sigma evenly, with a density of (n / pi)^(1/2) for
     each unit: so averaging leaves it as it is at the most probable sigma, where all others are
     averaged alike, and hypotheses' evidence can be compared with and without it.
-
-    Parameters
-    ----------
-    squared : ndarray, shape (m, n)
-        Squares of the residuals.
-
-    Returns
-    -------
-    ndarray, shape (m,)
     """
     n = squared.shape[1]
     value, _ = _profile(squared, at)
@@ -159,22 +128,10 @@ def ln_averaged(squared: Array, at: NoiseConditions) -> Array:
 
 
 def ln_averaging(raw: Array, left: Array, at: NoiseConditions) -> Array:
-    """Log of how far averaging over the noise lifts a fit's evidence at its most probable noise.
+    """Log of the factor by which averaging over the noise raises a fit's evidence, shape (m,).
 
     Laplace's method over ln sigma: of n residuals of which parameters took up p, its sd is
     (2 (n - p))^(-1/2), and the rest is as in `ln_averaged`.
-
-    Parameters
-    ----------
-    raw : ndarray, shape (m, n)
-        Residuals.
-    left : ndarray, shape (m, n)
-        The part of the variance of each that the parameters did not take up.
-
-    Returns
-    -------
-    ndarray, shape (m,)
-        Zero where a model has no value.
     """
     value, _ = _profile(np.square(raw) / left, at)
     known = np.isfinite(value).all(axis=1)

@@ -47,20 +47,13 @@ from calib.gap.constants import (
 )
 from calib.gap.fit import Fit
 from calib.gap.forward import Forward, fields_of_all
-from calib.gap.noise import Noise, noise_conditions
+from calib.gap.noise import Noise
 from calib.inference.random import generator, latin
 from calib.models.base import Array
 
 
 def ln_size_restriction(asked: Sequence[tuple[Fit, int]], seed: int) -> list[float]:
-    """Log of the factor by which restricting hypotheses to relevant sizes changes their evidence.
-
-    Parameters
-    ----------
-    asked : sequence of (Fit, int)
-        On the same campaigns, with the number of draws: of the prior, and of the posterior where it
-        has no sample. Zero for those that are not asked after.
-    """
+    """Log of the factor by which requiring a minimum size changes hypotheses' evidence."""
     known = [i for i, (f, n) in enumerate(asked) if n and f.forward.hypothesis.name != "none"]
     drawn = [psi for i in known for psi in _drawn(*asked[i], seed)]
     fits = [asked[i][0] for i in known for _ in range(2)]
@@ -187,13 +180,8 @@ def _rms(
     data: Campaigns, noise: Mapping[str, Noise], change: Mapping[str, Array]
 ) -> dict[str, Array]:
     """Rms of changes (k, n) of each output over its field rows, in noise sds, shape (k,)."""
-    at = noise_conditions(data.view)
-    return {
-        o.name: np.sqrt(
-            np.square(change[o.name][:, o.rows] / noise[o.name].sd(at.rows(o.rows))).mean(axis=1)
-        )
-        for o in data.outputs
-    }
+    each = data.in_noise(change, noise)
+    return {name: np.sqrt(np.square(values).mean(axis=1)) for name, values in each.items()}
 
 
 def left_of(gap: float) -> float:

@@ -47,10 +47,6 @@ def change_over_runs(residual: Array, order: Array) -> float:
     """Most by which a straight line or one step over the runs raises the log likelihood.
 
     The noise is what is left in either case.
-
-    Parameters
-    ----------
-    residual, order : ndarray, shape (n,)
     """
     z = residual[np.argsort(order, kind="stable")]
     n, u = z.size, np.arange(z.size) - 0.5 * (z.size - 1)
@@ -66,13 +62,7 @@ def change_over_runs(residual: Array, order: Array) -> float:
 
 
 def follows_runs(data: Campaigns, none: Fit) -> set[str]:
-    """Roles of the outputs whose residuals without a gap change over the runs.
-
-    Parameters
-    ----------
-    none : Fit
-        Of noise alone.
-    """
+    """Roles of the outputs whose residuals without a gap change over the runs."""
     if data.view.column("order") is None:
         return set()
     order = data.view.of("order")

@@ -12,8 +12,7 @@ from calib.data import Table
 from calib.data.checks import mixed_units
 from calib.data.files import plain_number
 from calib.data.quantities import OUTPUTS, QUANTITIES, role_of
-from calib.errors import CalibError
-from calib.gap.campaigns import Campaigns, OutputData, campaigns
+from calib.gap.campaigns import Campaigns, OutputData, campaigns, check_ratio
 from calib.gap.case import Case
 from calib.gap.constants import (
     FAR_CONDITION,
@@ -23,7 +22,6 @@ from calib.gap.constants import (
     IMPOSSIBLE_READING,
     LAB_OUTLIER,
     LEFT_OVER,
-    MAX_RATIO,
     MOST_ROUNDS,
 )
 from calib.gap.ranking import Lab, Ranking, calibrate_lab
@@ -32,27 +30,12 @@ from calib.models.base import Array
 
 
 def check_units(case: Case) -> None:
-    """Refuse campaigns whose conditions cannot be in the same unit.
-
-    Raises
-    ------
-    CalibError
-        Naming the column and its typical values.
-    """
-    for name in _used(case):
-        if name not in case.lab or name not in case.field:
-            continue
-        lab, field = (float(np.median(table[name])) for table in (case.lab, case.field))
-        if min(lab, field) <= 0.0 or 1.0 / MAX_RATIO < field / lab < MAX_RATIO:
-            continue
-        unit = QUANTITIES[name].unit
-        raise CalibError(
-            f"{QUANTITIES[name].word} is typically {plain_number(field)} {unit} in the field and "
-            f"{plain_number(lab)} {unit} in the calibration",
-            where=f"{case.field.source}, column {case.field.header_of(name)!r}",
-            expected=f"campaigns whose conditions differ by less than a factor of {MAX_RATIO:g}",
-            hint="check the units in the column names",
-        )
+    """Refuse campaigns whose conditions cannot be in the same unit."""
+    for name in {c: None for model in case.models.values() for c in get_model(model).conditions}:
+        if name in case.lab and name in case.field:
+            lab, field = (float(np.median(table[name])) for table in (case.lab, case.field))
+            if min(lab, field) > 0.0:
+                check_ratio(case, name, lab, field, "conditions")
 
 
 def without_far_conditions(case: Case) -> tuple[Case, list[str]]:
@@ -78,12 +61,6 @@ def without_far_conditions(case: Case) -> tuple[Case, list[str]]:
             said.append(_said_conditions(field, name, in_field))
             field = _without_condition(field, name, in_field)
     return replace(case, lab=lab, field=field), said
-
-
-def _used(case: Case) -> list[str]:
-    """Conditions that the case's models take."""
-    found = [name for model in case.models.values() for name in get_model(model).conditions]
-    return list(dict.fromkeys(found))
 
 
 def _far(values: Array) -> NDArray[np.bool_]:
@@ -157,15 +134,7 @@ def screen(case: Case, seed: int) -> tuple[Campaigns, Lab, list[str]]:
 
 
 def without_field_outliers(data: Campaigns, ranking: Ranking) -> tuple[Campaigns, list[str]]:
-    """Set field rows aside that no hypothesis explains, however good it is for the others.
-
-    Returns
-    -------
-    Campaigns
-        The same object where there are none.
-    list of str
-        What was set aside, and why.
-    """
+    """Set field rows aside that no hypothesis explains, however good it is for the others."""
     far = _field_outliers(data, ranking)
     if not far:
         return data, []
@@ -284,9 +253,7 @@ def _without_lab_outliers(data: Campaigns, seed: int) -> tuple[Campaigns, Lab, l
 
 def _lab_residuals(o: OutputData, mode: Array) -> Array:
     """Residuals of the laboratory fit in robust sds, shape (n,)."""
-    location = o.problem.bound.mean_response(o.priors.to_natural(mode[None]), o.problem.conditions)[
-        0
-    ]
-    residual = o.problem.response - location
+    theta = o.priors.to_natural(mode[None])
+    residual = o.problem.response - o.problem.bound.mean_response(theta, o.problem.conditions)[0]
     robust = 1.4826 * float(np.median(np.abs(residual - np.median(residual))))
     return np.asarray(residual / max(robust, 1e-12))

@@ -23,7 +23,6 @@ import numpy as np
 
 from calib.gap.campaigns import Campaigns
 from calib.gap.constants import SEARCH, WIDE
-from calib.gap.discrepancy import Bases
 from calib.gap.effects import Effect
 from calib.gap.fit import Fit, Start, finished, truncated_fits
 from calib.gap.forward import Forward
@@ -100,7 +99,6 @@ class StartingPoints:
     ) -> None:
         self.data, self.lab_mode, self.noise = data, lab_mode, noise
         self.odds = odds
-        self._bases: Bases = {}
 
     def fit(self, hypotheses: Sequence[Hypothesis]) -> dict[str, tuple[Fit, ...]]:
         """Fit from the lab's calibration, by name."""
@@ -205,7 +203,7 @@ class StartingPoints:
 
     def _forward(self, hypothesis: Hypothesis) -> tuple[Forward, Array]:
         scale = {o: n.sigma for o, n in self.noise.items()}
-        forward = Forward(self.data, hypothesis, scale, self.lab_mode, bases=self._bases)
+        forward = Forward(self.data, hypothesis, scale, self.lab_mode)
         start = np.array([p.loc for p in forward.priors.free])
         for o in self.data.outputs:
             start[forward.theta_slices[o.name]] = self.lab_mode[o.name]
@@ -299,15 +297,7 @@ type _Started = tuple[Hypothesis, list[Fit]]
 def search_sets(
     guesses: StartingPoints, single: Sequence[str], fits: Mapping[str, tuple[Fit, ...]]
 ) -> dict[str, tuple[Fit, ...]]:
-    """Fit what is not listed, by itself and beside the best explanations, and sets of effects.
-
-    Parameters
-    ----------
-    single : sequence of str
-        Effects that sets are made of.
-    fits : mapping of str to tuple of Fit
-        Of everything that is one cause, or none; of several those with their usual priors first.
-    """
+    """Fit what is not listed, by itself and beside the best explanations, and sets of effects."""
     n = guesses.odds
     first = (group[0].forward.hypothesis for group in fits.values())
     usual = {h.name: h.effect_priors[0] for h in first if h.effects}

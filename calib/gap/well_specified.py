@@ -33,7 +33,6 @@ from calib.models.base import Array
 
 # The gap that is drawn is the one asked for within this ratio.
 SIZE_RATIO = 1.25
-_DRAWS, _TRIES = 4000, 40
 
 
 def well_specified_case(
@@ -142,30 +141,11 @@ def draw_from_hypothesis(
     gap_over_noise: float,
     rng: np.random.Generator,
 ) -> Draw:
-    """Draw what happens in the field from the prior of a kind of truth.
-
-    Parameters
-    ----------
-    data : Campaigns
-        The design, and the simulators at their lab calibration.
-    lab_mode : mapping of str to ndarray
-        Internal parameters of each simulator.
-    noise : mapping of str to Noise
-        Of each output, on the scale of the response.
-    truth : str
-        Contract name; sets of effects in alphabetical order.
-    gap_over_noise : float
-        The size wanted, rms in noise sds; met within a ratio of 1.25.
-
-    Raises
-    ------
-    CalibError
-        If the diagnosis does not test this truth on this design, or no draw has the size.
-    """
+    """Draw what happens in the field from the prior of a kind of truth."""
     scale = {o: n.sigma for o, n in noise.items()}
-    for _ in range(_TRIES):
+    for _ in range(40):
         forward = Forward(data, _hypothesis(data, truth, rng), scale, lab_mode)
-        psi = forward.priors.sample(rng, 1 if truth == "none" else _DRAWS)
+        psi = forward.priors.sample(rng, 1 if truth == "none" else 4000)
         for o in data.outputs:
             psi[:, forward.theta_slices[o.name]] = lab_mode[o.name]
         if truth == "none":
@@ -178,7 +158,7 @@ def draw_from_hypothesis(
             first = int(np.argmax(fits))
             return Draw(forward, psi[[first]], float(size[first]))
     raise CalibError(
-        f"no {truth} of {gap_over_noise:.1f} noise sds in {_DRAWS * _TRIES} draws of its prior",
+        f"no {truth} of {gap_over_noise:.1f} noise sds in 160000 draws of its prior",
         hint="leave this case out",
     )
 
@@ -204,14 +184,10 @@ def _gap(
     forward: Forward, psi: Array, noise: Mapping[str, Noise], cause: str = ""
 ) -> NDArray[np.float64]:
     """Size of what happens in the field, or of what goes with one of its causes, shape (k,)."""
-    data = forward.data
-    at = noise_conditions(data.view)
+    view = forward.data.view
     with np.errstate(all="ignore"):
-        full, rest = forward.field(psi, data.view), forward.simulator(psi, data.view)
-        rest = forward.without(psi, data.view, cause) if cause else rest
-    each = [
-        ((full[o.name] - rest[o.name])[:, o.rows] / noise[o.name].sd(at.rows(o.rows))) ** 2
-        for o in data.outputs
-    ]
+        full = forward.field(psi, view)
+        rest = forward.without(psi, view, cause) if cause else forward.simulator(psi, view)
+    each = forward.data.in_noise({name: full[name] - rest[name] for name in full}, noise)
     # Where the model has no value somewhere, it is NaN, which is of no size.
-    return np.sqrt(np.concatenate(each, axis=1).mean(axis=1))
+    return np.sqrt(np.square(np.hstack([*each.values()])).mean(axis=1))

@@ -1,21 +1,33 @@
-"""A case made ready: what is wrong is named, and rows without an output are left out."""
+"""Campaigns bound to models: references, refusals, scaled conditions, simulators."""
 
 from __future__ import annotations
 
 import re
 from contextlib import nullcontext
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import calib
 from calib.data import table_from_arrays
 from calib.errors import CalibError
-from calib.gap.campaigns import campaigns
+from calib.gap.campaigns import Campaigns, CaseSimulator, campaigns, columns_over
 from calib.gap.case import Case
-from calib.gap.plausibility import oddities
+from calib.gap.fit import fit
+from calib.gap.forward import Forward
+from calib.gap.hypotheses import Hypothesis
+from calib.gap.noise import Noise
+from calib.inference.emulation.prepared import prepare
+from calib.inference.likelihood import log_normal
 from calib.inference.prior_files import DeclaredPriors, default_priors
-from tests.gap.cases import PULL_ONLY, make_case, table_without
+from calib.models.simulators.emulator import emulator_of
+from tests.gap.cases import PULL_ONLY, campaigns_of, make_case, table_without
+from tests.gap.fits import log_joint
+from tests.gap.test_hypotheses import density_campaigns
+from tests.inference.emulation.test_emulate import as_before as as_before
+from tests.models.simulators.examples import PRIORS, lab, pull
 
 
 @pytest.mark.parametrize("campaign", ["lab", "field"])
@@ -75,15 +87,6 @@ def test_ground_pressure_follows_inflation_pressure_as_in_the_data():
     assert campaigns(steeper).view.ground_exponent == pytest.approx(0.8, abs=1e-9)
 
 
-def test_without_pressures_the_exponent_is_a_half():
-    case = make_case(models=PULL_ONLY)
-    bare = [
-        table_without(t, "inflation_pressure_psi", "average_ground_pressure_kpa")
-        for t in (case.lab, case.field)
-    ]
-    assert campaigns(Case("bare", *bare, PULL_ONLY)).view.ground_exponent == 0.5
-
-
 @pytest.mark.parametrize(("power", "exponent"), [(1.4, 1.4), (2.0, 1.5), (-0.3, 0.0)])
 @pytest.mark.parametrize("known", ["both", "field"])
 def test_the_exponent_is_that_of_a_tyre_on_soft_ground(known, power, exponent):
@@ -103,29 +106,6 @@ def test_the_exponent_is_that_of_a_tyre_on_soft_ground(known, power, exponent):
     assert found == pytest.approx(exponent, abs=1e-9)
 
 
-def test_a_ground_pressure_by_itself_has_no_exponent():
-    case = make_case(models=PULL_ONLY)
-    tables = [table_without(t, "inflation_pressure_psi") for t in (case.lab, case.field)]
-    assert campaigns(Case("bare", *tables, PULL_ONLY)).view.ground_exponent == 0.5
-
-
-def test_outputs_are_known_by_name_and_by_role():
-    data = campaigns(make_case())
-    assert data.names == ("drawbar_pull", "rut_depth")
-    assert data.roles == ("pull", "sinkage")
-    assert data.with_role("sinkage") == ("rut_depth",)
-    assert data.with_role("density") == ()
-
-
-def test_the_simulators_parameters_are_the_models_without_the_noise():
-    pull, rut = campaigns(make_case()).outputs
-    assert pull.priors.names == (
-        "K_lo", "K_hi", "K_bend", "D_lo", "D_hi", "D_bend", "G_lo", "G_hi", "G_bend", "C",
-    )  # fmt: skip
-    assert rut.priors.names == ("z_ref", "n0", "n1")
-    assert rut.problem.priors.names == (*rut.priors.names, "sigma")
-
-
 def holed(rows_of_lab, rows_of_field) -> Case:
     """Return a case that lacks the pull of some rows."""
     case = make_case()
@@ -135,71 +115,6 @@ def holed(rows_of_lab, rows_of_field) -> Case:
         columns["drawbar_pull_kn"][rows] = np.nan
         tables.append(table_from_arrays(columns, allow_missing=("drawbar_pull_kn",)))
     return replace(case, lab=tables[0], field=tables[1])
-
-
-def test_what_was_observed_is_of_the_rows_that_have_it():
-    """One output after the other: the laboratory's rows, then the field's, on their scales."""
-    case = holed([0, 7], [2, 5, 26])
-    data = campaigns(case)
-    lab, field = (np.isfinite(t["drawbar_pull_kn"]) for t in (case.lab, case.field))
-    expected = [
-        case.lab["drawbar_pull_kn"][lab], case.field["drawbar_pull_kn"][field],
-        np.log(case.lab["rut_depth_mm"]), np.log(case.field["rut_depth_mm"]),
-    ]  # fmt: skip
-    np.testing.assert_allclose(data.observed, np.concatenate(expected), rtol=1e-12)
-    for name, parts in {"drawbar_pull": (lab, field), "rut_depth": (slice(None),) * 2}.items():
-        at = data.at_rows[name]
-        slip, psi = (
-            np.concatenate([t[c][rows] for t, rows in zip((case.lab, case.field), parts,
-                                                          strict=True)])
-            for c in ("slip_ratio", "inflation_pressure_psi")
-        )  # fmt: skip
-        np.testing.assert_array_equal(at.slip, slip)
-        np.testing.assert_allclose(at.softness, -np.log(psi / 30.0), atol=1e-12)
-
-
-def test_other_conditions_are_filled_up_with_what_is_usual():
-    """A covariate that they lack is the laboratory's median, or the field's; no output is."""
-    case = make_case()
-    lab = table_without(case.lab, "pass_number")
-    data = campaigns(replace(case, lab=lab))
-    slip = np.array([0.1, 0.3, 0.5])
-    for view in (
-        data.at_conditions({"slip_ratio": slip}), data.at(table_from_arrays({"slip_ratio": slip})),
-    ):  # fmt: skip
-        expected = {
-            "slip_ratio": slip, "run_order": 14.5, "inflation_pressure_psi": 30.0,
-            "average_ground_pressure_kpa": 30.0 * 30.0**0.5, "normal_load_kn": 5.0,
-            "speed_m_s": 0.3, "pass_number": np.median(case.field["pass_number"]),
-        }  # fmt: skip
-        assert set(view.conditions) == set(expected)
-        for name, values in expected.items():
-            np.testing.assert_allclose(view.conditions[name], np.resize(values, 3))
-        assert replace(view, conditions=data.view.conditions) == data.view
-
-
-def test_the_range_of_pressures_is_that_of_both_campaigns():
-    case = make_case(models=PULL_ONLY)
-    tables = []
-    for table, low, high in ((case.lab, 20.0, 41.0), (case.field, 19.0, 40.0)):
-        psi = np.clip(table["inflation_pressure_psi"], low, high)
-        tables.append(replace(table, columns={**table.columns, "inflation_pressure_psi": psi}))
-    data = campaigns(Case("pressed", *tables, PULL_ONLY))
-    assert data.simulated["drawbar_pull"]._pressures == (19.0, 41.0)
-
-
-def test_load_and_order_are_the_recorded_ones_or_usual():
-    case = make_case(models=PULL_ONLY)
-    bare = [table_without(t, "normal_load_kn", "run_order") for t in (case.lab, case.field)]
-    view = campaigns(Case("bare", *bare, PULL_ONLY)).view
-    assert (view.load_kn, view.order_range) == (5.0, (0.0, 1.0))
-    loaded = [
-        replace(t, columns={**t.columns, "normal_load_kn": np.linspace(low, low + 2.0, len(t))})
-        for t, low in zip((case.lab, case.field), (3.0, 7.0), strict=True)
-    ]
-    assert campaigns(Case("both", *loaded, PULL_ONLY)).view.load_kn == pytest.approx(4.0)
-    of_field = Case("field", table_without(case.lab, "normal_load_kn"), loaded[1], PULL_ONLY)
-    assert campaigns(of_field).view.load_kn == pytest.approx(8.0)
 
 
 @pytest.mark.parametrize(("n", "refused"), [(4, True), (5, False)])
@@ -226,28 +141,6 @@ def test_outputs_are_compared_by_their_typical_size(lab, field, refused):
         tables.append(replace(table, columns={**table.columns, "drawbar_pull_kn": pull}))
     with pytest.raises(CalibError, match="typically") if refused else nullcontext():
         campaigns(Case("sized", *tables, PULL_ONLY))
-
-
-@pytest.mark.parametrize(
-    ("field", "refused"), [(1.0, False), (0.02, False), (0.005, True), (200.0, True)]
-)
-@pytest.mark.parametrize("unit", [1e-4, 1.0])
-def test_outputs_a_hundred_times_apart_are_refused_however_small_they_are(unit, field, refused):
-    case = make_case(models=PULL_ONLY)
-    lab, there = (
-        replace(
-            t,
-            columns={
-                **t.columns,
-                "drawbar_pull_kn": f * t["drawbar_pull_kn"],
-                "normal_load_kn": unit * t["normal_load_kn"],
-            },
-        )
-        for t, f in ((case.lab, unit), (case.field, unit * field))
-    )
-    scaled = replace(case, lab=lab, field=there)
-    with pytest.raises(CalibError, match="a factor of 100") if refused else nullcontext():
-        campaigns(scaled)
 
 
 @pytest.mark.parametrize(("size", "refused"), [(1.0, False), (1e-3, True), (1e3, True)])
@@ -277,20 +170,188 @@ def test_a_load_that_is_assumed_for_effects_and_the_pull_contradicts_is_refused(
         assert "add the column normal_load_kn" in str(caught.value)
 
 
-def test_field_rows_that_are_the_calibrations_are_counted():
-    case = make_case()
-    columns = {
-        name: np.concatenate([case.lab[name][:3], values[3:]])
-        for name, values in case.field.columns.items()
-    }
-    copied = replace(case, field=table_from_arrays(columns))
-    said = oddities(copied.lab, copied.field, copied.models)
-    assert any("3 of 27 field rows are rows of the calibration" in w for w in said)
-    said = oddities(case.lab, case.field, case.models)
-    assert not any("rows of the calibration" in w for w in said)
-
-
 def test_the_calibration_itself_is_no_field():
     case = make_case()
     with pytest.raises(CalibError, match="every field row is a row of the calibration"):
         campaigns(replace(case, field=case.lab))
+
+
+def test_both_campaigns_span_the_scale():
+    data = campaigns(make_case(models=PULL_ONLY))
+    slip = data.scaled(data.view, "slip")
+    both = np.concatenate([data.case.lab["slip_ratio"], data.case.field["slip_ratio"]])
+    expected = 2.0 * (data.case.field["slip_ratio"] - both.min()) / np.ptp(both) - 1.0
+    np.testing.assert_allclose(slip, expected, atol=1e-12)
+
+
+def test_speeds_are_even_in_ratios():
+    data = campaigns(make_case(models=PULL_ONLY))
+    both = np.concatenate([data.view.conditions["speed_m_s"], data.case.lab["speed_m_s"]])
+    middle = np.full(27, np.sqrt(both.min() * both.max()))
+    view = replace(data.view, conditions={**data.view.conditions, "speed_m_s": middle})
+    scaled = data.scaled(view, "speed")
+    np.testing.assert_allclose(scaled, 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("what", "columns"),
+    [
+        ("water", ("gravimetric_water_content", "volumetric_water_content")),
+        ("pressure", ("inflation_pressure_psi", "average_ground_pressure_kpa")),
+        ("low_pressure", ("inflation_pressure_psi",)),
+        ("slip", ("slip_ratio",)),
+        ("tyre_temperature_c", ("tyre_temperature_c",)),
+    ],
+)
+def test_what_something_may_vary_with_has_its_columns(what, columns):
+    assert columns_over(what) == columns
+
+
+PSI = "inflation_pressure_psi"
+
+
+@pytest.fixture(scope="module")
+def data():
+    return campaigns_of(None)
+
+
+def middle(simulated: CaseSimulator, k: int = 2) -> tuple[np.ndarray, np.ndarray]:
+    t = np.tile([p.loc for p in simulated.priors], (k, 1))
+    t += (
+        0.2
+        * np.random.default_rng(1).standard_normal(t.shape)
+        * [p.scale for p in simulated.priors]
+    )
+    return t, np.zeros((k, simulated.n_bends + simulated.n_errors))
+
+
+def test_beyond_the_pressures_of_both_campaigns_it_goes_on_straight(data):
+    """From 18 psi to 42 psi; also where each parameter vector has pressures of its own."""
+    simulated = data.simulated["drawbar_pull"]
+    t, misfit = middle(simulated)
+
+    def at(pressure):
+        return simulated.predict(t, misfit, {**simulated.field, PSI: pressure})
+
+    flat = np.full(27, 1.0)
+    low, high = at(18.0 * flat), at(42.0 * flat)
+    assert np.abs(high - low).max() > 0.05
+    pressure = np.linspace(10.0, 54.0, 27)
+    for own in (pressure, np.stack([pressure, pressure[::-1]])):
+        found = simulated.predict_beyond(t, misfit, {**simulated.field, PSI: own})
+        expected = at(np.clip(own, 18.0, 42.0)) + (high - low) * (own - np.clip(own, 18, 42)) / 24.0
+        np.testing.assert_allclose(found, expected, rtol=1e-9)
+    inside = {**simulated.field, PSI: np.linspace(18.0, 42.0, 27)}
+    np.testing.assert_array_equal(
+        simulated.predict_beyond(t, misfit, inside), simulated.predict(t, misfit, inside)
+    )
+    # One pressure only is no range to go on from, and the field's own lie inside.
+    for other in (
+        CaseSimulator(data.outputs[0], data.view, (30.0, 30.0)),
+        CaseSimulator(data.outputs[0], data.view, (20.0, 25.0)),
+    ):
+        conditions = {**other.field, PSI: data.view.conditions[PSI]}
+        np.testing.assert_array_equal(
+            other.predict_beyond(t, misfit, conditions), other.predict(t, misfit, conditions)
+        )
+    wide = {**data.simulated["drawbar_pull"].field, PSI: pressure}
+    only = CaseSimulator(data.outputs[0], data.view, (30.0, 30.0))
+    np.testing.assert_array_equal(
+        only.predict_beyond(t, misfit, wide), only.predict(t, misfit, wide)
+    )
+
+
+def test_a_density_is_bent_no_farther_than_two_and_a_half_ranges_out():
+    data = campaigns(density_campaigns())
+    simulated = data.simulated["bulk_density"]
+    wet, cone = (simulated.lab[n] for n in ("gravimetric_water_content", "cone_index_kpa"))
+    half, mid = 0.5 * np.ptp(wet), 0.5 * (wet.max() + wet.min())
+    logs = np.log(cone)
+    half_log, mid_log = 0.5 * np.ptp(logs), 0.5 * (logs.max() + logs.min())
+    u, v = np.array([0.5, 2.4, 3.1, -4.0]), np.array([-1.5, 0.0, 2.0, 2.6])
+    # Any size of a cone index: its logarithm is taken.
+    at = {
+        "gravimetric_water_content": mid + half * u,
+        "cone_index_kpa": np.exp(mid_log + half_log * v),
+    }
+    t, misfit = middle(simulated, 4)
+    t[:] = t[0]
+    misfit[1:] = np.eye(3)
+    found = simulated.predict(t, misfit, at)
+    bends = found[1:] - found[0]
+    u, v = np.clip(u, -2.5, 2.5), np.clip(v, -2.5, 2.5)
+    expected = {"uu": u * u - 1 / 3, "uv": u * v, "vv": v * v - 1 / 3}
+    one, other = (list(simulated.lab).index(n) for n in at)
+    order = ("uu", "uv", "vv") if one < other else ("vv", "uv", "uu")
+    np.testing.assert_allclose(bends, [expected[name] for name in order], rtol=1e-6)
+
+
+NOISE = 0.03
+
+
+def emulated(folder: Path, runs: int) -> Campaigns:
+    """The same wheel in both campaigns, its emulator from some runs."""
+    calib.register(
+        calib.from_callable(
+            pull, parameters=PRIORS, conditions=["slip_ratio", "normal_load_kn"],
+            output="drawbar_pull_kn", name="wheel", emulate=True, folder=folder, runs=runs,
+            first=min(runs, 20), checks=0,
+        )
+    )  # fmt: skip
+    tables = [calib.table_from_arrays(lab(np.random.default_rng(s), NOISE)) for s in (1, 2)]
+    prepare("wheel", tables[0], 1)
+    return campaigns(Case("case", *tables, {"drawbar_pull": "wheel"}))
+
+
+def test_a_crude_emulators_error_is_in_the_likelihood(tmp_path: Path) -> None:
+    data = emulated(tmp_path, 12)
+    (o,) = data.outputs
+    simulated = data.simulated["drawbar_pull"]
+    emulator = emulator_of(o.problem.bound.model)
+    assert emulator is not None
+    assert simulated.n_errors >= 1
+    forward = Forward(data, Hypothesis("none"), {o.name: NOISE})
+    names = [p.name for p in forward.priors.free]
+    assert names.count("drawbar_pull.emulator") == simulated.n_errors
+
+    # Its coefficients taken out by integration, it is the density of the calibration: normal with
+    # the covariance that noise and emulator have, over the rows of both campaigns together.
+    theta = emulator.axes.natural(emulator.regions[-1].centre[None])
+    at = simulated.both
+    curves = emulator.curves_at(at)[:, 1:]
+    covariance = (curves * emulator.typical_variances) @ curves.T
+    t = o.priors.to_internal(theta)
+    psi = np.zeros((1 + simulated.n_errors, forward.n_dim))
+    psi[:, forward.theta_slices[o.name]] = t
+    psi[1:, forward.misfit_slices[o.name]] = np.eye(simulated.n_errors)
+    predicted = np.concatenate([part[o.name] for part in forward.plain(psi)], axis=1)
+    ours = (predicted[1:] - predicted[0]).T @ (predicted[1:] - predicted[0])
+    scale = np.sqrt(np.diag(covariance).max())
+    np.testing.assert_allclose(ours, covariance, atol=(0.02 * NOISE) ** 2 + 0.01 * scale**2)
+    observed = data.observed
+    residuals = observed - predicted[:1]
+    scaled = curves * np.sqrt(emulator.typical_variances)
+    marginal = log_normal(residuals, np.ones(1), scaled, np.array([NOISE]))
+    found = np.linalg.slogdet(np.eye(len(observed)) * NOISE**2 + ours)[1]
+    weighed = np.linalg.solve(np.eye(len(observed)) * NOISE**2 + ours, residuals[0])
+    value = -0.5 * (residuals[0] @ weighed + found + len(observed) * np.log(2.0 * np.pi))
+    assert value == pytest.approx(float(marginal[0]), abs=0.05)
+    # Conditions of each vector's own, as an effect on a gauge gives, are taken as well.
+    own = {name: np.tile(v, (len(psi), 1)) for name, v in at.items()}
+    again = simulated.predict(
+        psi[:, forward.theta_slices[o.name]], psi[:, forward.misfit_slices[o.name]], own
+    )
+    np.testing.assert_allclose(again, predicted, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_good_emulator_adds_next_to_nothing(tmp_path: Path) -> None:
+    data = emulated(tmp_path, 60)
+    simulated = data.simulated["drawbar_pull"]
+    assert simulated.n_errors <= 2
+    forward = Forward(data, Hypothesis("none"), {"drawbar_pull": NOISE})
+    start = np.array([p.loc for p in forward.priors.free])
+    start[forward.misfit_slices["drawbar_pull"]] = 0.0
+    found = fit(forward, start, {"drawbar_pull": Noise(NOISE)})
+    assert np.isfinite(found.log_evidence)
+    assert np.isfinite(log_joint(found, found.psi[None])).all()

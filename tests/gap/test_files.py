@@ -1,22 +1,42 @@
-"""The files: diagnosis.json and fresh_prediction.csv exactly as the contract has them."""
+"""The files of diagnoses: contract, verdicts, batches, track record."""
 
 from __future__ import annotations
 
 import csv
 import json
+import shutil
+import tomllib
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import beta
 
-from calib.data import read_table
+from calib.data import read_table, table_from_arrays
+from calib.errors import CalibError
+from calib.gap import batch
+from calib.gap.batch import case_folders, diagnose_cases
+from calib.gap.campaigns import campaigns
 from calib.gap.case import read_case
-from calib.gap.diagnose import diagnose
+from calib.gap.diagnose import assumed, diagnose, diagnose_once, placebos, verdict
+from calib.gap.document import track_record
 from calib.gap.effects import EFFECTS
 from calib.gap.files import document, write_diagnosis
+from calib.gap.hypotheses import Hypothesis, joined, singles
 from calib.gap.identifiability import NextMeasurement
 from calib.gap.mixture import Region
-from tests.gap.cases import CHOICE, PULL_ONLY, diagnosis_of, make_case, pull_diagnosis, write_case
+from tests.gap.cases import (
+    CHOICE,
+    PULL_ONLY,
+    diagnosis_of,
+    make_case,
+    pull_diagnosis,
+    table_without,
+    write_case,
+)
+from tests.gap.fits import fit_at
 
 
 @pytest.fixture(scope="module")
@@ -165,34 +185,6 @@ def test_without_conditions_to_predict_there_is_no_prediction(tmp_path):
     assert not (tmp_path / "fresh_prediction.csv").exists()
 
 
-def test_every_number_is_the_one_that_was_found():
-    found = diagnosis_of("sensor_drift")
-    d, ranking = document(found), found.ranking
-    assert [e["name"] for e in d["effects"]] == ranking.order
-    assert {e["name"]: e["probability"] for e in d["effects"]} == dict(ranking.probability)
-    assert d["where"] == [
-        {
-            "output": g.output, "row": int(g.rows[i]), "gap": g.gap[i], "gap_sd": g.sd[i],
-            "probability": g.probability[i],
-        }
-        for g in found.gaps for i in range(g.rows.size)
-    ]  # fmt: skip
-    for name, s in found.shrink.items():
-        assert d["shrink"][name] == {
-            "rmse_before": s.rmse_before, "rmse_after": s.rmse_after, "fraction": s.fraction,
-            "interval": list(s.interval), "noise_floor": s.noise_floor,
-        }  # fmt: skip
-    assert d["shrink"]
-    for name, cause in [
-        *found.inclusion.causes.items(),
-        ("", found.inclusion.residual_discrepancy),
-    ]:
-        part = d["inclusion"].get(name, d["remainder"])
-        told = (part["probability"], part["share"], tuple(part["share_interval"]))
-        assert told == (cause.probability, cause.share, cause.share_interval)
-    assert [(n["name"], n["reason"]) for n in d["not_testable"]] == [*ranking.not_testable.items()]
-
-
 def test_conditions_are_told_by_ends_or_by_the_name_of_a_category():
     """Of regions, of what is left, and of what to measure next; a zero is a number, too."""
     found = diagnosis_of("sensor_drift")
@@ -228,3 +220,217 @@ def test_a_null_says_none():
     assert d["verdict"] == "none"
     assert d["shrink"] == {}
     assert d["regions"] == []
+
+
+@pytest.mark.parametrize(
+    ("probability", "expected"),
+    [
+        ({"none": 0.5, "a": 0.5}, "none"),
+        ({"none": 0.49, "a": 0.5}, "effect"),
+        ({"unknown": 0.5, "a": 0.5}, "unknown"),
+        ({"a": 0.3, "a+unknown": 0.2, "unknown": 0.49}, "effect"),
+        ({"a": 0.3, "a+unknown": 0.199, "unknown": 0.49}, "ambiguous"),
+        # Something unlisted beside causes that are none probable by themselves names nothing.
+        ({"a+unknown": 0.4, "b+unknown": 0.4}, "ambiguous"),
+        ({}, "ambiguous"),
+    ],
+)
+def test_a_verdict_needs_a_probability_of_one_half(probability, expected):
+    assert verdict(probability) == expected
+
+
+FEW = {
+    "rate_effect": EFFECTS["rate_effect"],
+    "multipass_compaction": EFFECTS["multipass_compaction"],
+}
+
+
+def test_conditions_to_predict_that_lack_what_the_field_has_are_named() -> None:
+    """And one that the field lacks explains nothing there."""
+    case = make_case("rate_effect", n_fresh=9)
+    fresh = case.new_conditions
+    assert fresh is not None
+    columns = {n: v for n, v in fresh.columns.items() if n != "speed_m_s"}
+    found = diagnose_once(replace(case, new_conditions=table_from_arrays(columns)), 1, FEW)
+    assert any("lacks speed_m_s, which the field campaign has" in w for w in found.warnings)
+    whole = diagnose_once(case, 1, FEW)
+    assert not any("lacks" in w for w in whole.warnings)
+    field = {n: v for n, v in case.field.columns.items() if n != "pass_number"}
+    without = diagnose_once(replace(case, field=table_from_arrays(field)), 1, FEW)
+    assert np.isfinite(without.shrink["drawbar_pull"].rmse_after)
+
+
+@pytest.fixture(scope="module")
+def cases(tmp_path_factory) -> list[Path]:
+    root = tmp_path_factory.mktemp("cases")
+    for i, effect in enumerate((None, "force_offset")):
+        case = make_case(effect, models=PULL_ONLY, n_lab=15, n_field=12, n_fresh=3, seed=i)
+        write_case(case, root / f"case-{i}")
+    (root / "not-a-case").mkdir()
+    return case_folders(root)
+
+
+@pytest.fixture(scope="module")
+def done(cases, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("done")
+    assert diagnose_cases(cases, out, 1) == {}
+    return out
+
+
+def content(out: Path) -> dict[str, bytes]:
+    return {
+        p.relative_to(out).as_posix(): p.read_bytes()
+        for p in sorted(out.rglob("*"))
+        if p.is_file() and p.suffix in (".json", ".csv") and p.name != "seconds.csv"
+    }
+
+
+def test_folders_with_a_case_in_them_are_found(cases, tmp_path):
+    assert [c.name for c in cases] == ["case-0", "case-1"]
+    with pytest.raises(CalibError, match="no cases"):
+        case_folders(tmp_path)
+
+
+def test_every_case_has_its_diagnosis(done):
+    assert json.loads((done / "case-0" / "diagnosis.json").read_text())["verdict"] == "none"
+    assert json.loads((done / "case-1" / "diagnosis.json").read_text())["verdict"] != "none"
+    assert sorted(p.name for p in done.iterdir()) == ["case-0", "case-1", "seconds.csv"]
+
+
+@pytest.mark.slow  # `tests/batch/test_cluster.py` has what it rests on
+def test_two_workers_write_the_same_bytes(cases, done, tmp_path):
+    assert diagnose_cases(cases, tmp_path / "two", 1, workers=2) == {}
+    assert content(tmp_path / "two") == content(done)
+    assert {"case-0/diagnosis.json", "case-1/diagnosis.json"} <= set(content(done))
+
+
+def test_what_is_there_is_not_done_again(cases, done, monkeypatch):
+    def refuse(*args, **kwargs):
+        raise AssertionError("done again")
+
+    monkeypatch.setattr(batch, "read_case", refuse)
+    seen = []
+    assert diagnose_cases(cases, done, 1, progress=lambda *p: seen.append(p)) == {}
+    assert seen == [(2, 2)]
+
+
+def test_it_takes_up_where_it_stopped(cases, done, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(done / "case-0", out / "case-0")
+    before = (out / "case-0" / "diagnosis.json").stat().st_mtime_ns
+    seen = []
+    diagnose_cases(cases, out, 1, progress=lambda *p: seen.append(p))
+    assert (out / "case-0" / "diagnosis.json").stat().st_mtime_ns == before
+    assert seen == [(1, 2), (2, 2)]
+    assert content(out) == content(done)
+
+
+@pytest.fixture
+def few_effects(monkeypatch) -> None:
+    """Diagnose among one effect, where what is found does not matter."""
+    few = {"force_offset": EFFECTS["force_offset"]}
+    monkeypatch.setattr(batch, "diagnose", partial(diagnose, effects=few))
+
+
+def test_a_case_that_fails_is_reported_and_leaves_nothing(cases, tmp_path, few_effects):
+    bad = write_case(make_case(models=PULL_ONLY, n_lab=15, n_field=12), tmp_path / "bad")
+    (bad / "lab.csv").unlink()
+    failed = diagnose_cases([bad, cases[0]], tmp_path / "out", 1)
+    assert list(failed) == ["bad"]
+    assert "lab.csv" in failed["bad"]
+    assert {p.name for p in (tmp_path / "out").iterdir() if p.is_dir()} == {"case-0"}
+    assert json.loads((tmp_path / "out" / "failed.json").read_text()) == failed
+
+
+def test_an_interruption_leaves_no_half_written_folder(cases, tmp_path, few_effects, monkeypatch):
+    def stop(found, folder):
+        (folder / "diagnosis.json").write_text("{")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(batch, "write_diagnosis", stop)
+    with pytest.raises(KeyboardInterrupt):
+        diagnose_cases(cases[:1], tmp_path / "out", 1)
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["seconds.csv"]
+
+
+def test_diagnoses_of_other_cases_are_not_taken_for_these(cases, done, tmp_path):
+    made = make_case(models=PULL_ONLY, n_lab=15, n_field=12, seed=9)
+    other = write_case(made, tmp_path / "case-0")
+    with pytest.raises(CalibError, match="of other cases"):
+        diagnose_cases([other], done, 1)
+    with pytest.raises(CalibError, match="--seed 1, not 2"):
+        diagnose_cases(cases, done, 2)
+
+
+ROOT = Path(__file__).resolve().parents[2]
+RECORDS = ROOT / "calib" / "gap" / "track_record.toml"
+
+
+@pytest.mark.parametrize("probability", [0.0, 0.3, 0.5, 0.65, 0.899, 0.9, 0.95, 1.0])
+def test_every_probability_has_the_record_of_its_bin(probability: float) -> None:
+    found = track_record(probability)
+    assert found.low <= probability <= found.high
+    low, high = beta.ppf([0.025, 0.975], found.right + 0.5, found.cases - found.right + 0.5)
+    assert found.interval == pytest.approx((low, high), rel=1e-9)
+    assert found.share == found.right / found.cases
+
+
+def test_the_bins_join_and_rise() -> None:
+    bins = [track_record(p) for p in (0.1, 0.55, 0.65, 0.75, 0.85, 0.95)]
+    assert [b.low for b in bins[1:]] == [b.high for b in bins[:-1]]
+    assert bins[-1].cases > 1000
+    assert 0.97 < bins[-1].share < 0.99
+
+
+def test_a_bin_is_the_sum_of_all_records() -> None:
+    records = tomllib.loads(RECORDS.read_text(encoding="utf-8"))["record"]
+    bins = [b for record in records for b in record["bins"] if b[0] == 0.9]
+    assert track_record(0.93).cases == sum(b[2] for b in bins)
+    assert track_record(0.93).right == sum(b[3] for b in bins)
+
+
+def data_without(*columns):
+    case = make_case("rate_effect")
+    lab = case.lab
+    for column in columns:
+        lab = table_without(lab, column)
+    return campaigns(replace(case, lab=lab))
+
+
+@pytest.mark.parametrize(
+    ("lacking", "effects", "value"),
+    [
+        (("pass_number",), ("multipass_compaction",), {"pass_number": 1.0}),
+        (("speed_m_s",), ("rate_effect",), {"speed_m_s": "median"}),
+        (("pass_number", "speed_m_s"), ("multipass_compaction", "rate_effect"),
+         {"pass_number": 1.0, "speed_m_s": "median"}),
+        (("pass_number",), ("rate_effect",), {}),
+        ((), ("multipass_compaction",), {}),
+    ],
+)  # fmt: skip
+def test_only_what_the_hypothesis_rests_on_is_named(lacking, effects, value):
+    data = data_without(*lacking)
+    chosen = singles(data, {name: EFFECTS[name] for name in effects})
+    hypothesis = chosen[0] if len(chosen) == 1 else joined(*chosen)
+    median = float(np.median(data.case.field["speed_m_s"]))
+    assert assumed(fit_at(data, hypothesis)) == {
+        column: median if v == "median" else v for column, v in value.items()
+    }
+
+
+def test_without_effects_nothing_is_assumed():
+    assert assumed(fit_at(data_without("pass_number"), Hypothesis("none"))) == {}
+
+
+def test_placebos_are_on_one_noise():
+    found = diagnosis_of("sensor_drift")
+    placebo = placebos(found)
+    best = found.ranking.order[0]
+    residual = np.concatenate(list(found.ranking.best(best).field_residuals.values()))
+    assert placebo.left[best] == pytest.approx(np.sqrt(np.mean(np.square(residual))))
+    # A wrong hypothesis inflates its own noise: on its own scale it would look as good.
+    assert placebo.left["none"] > 1.3 * placebo.left[best]
+    assert placebo.before > placebo.left["none"] - 1e-9
+    assert placebo.shrink(best) == pytest.approx(1.0 - placebo.left[best] / placebo.before)
+    assert "unknown" in placebo.left
+    assert not any("+" in n for n in placebo.left if n != best)

@@ -1,18 +1,26 @@
-"""The joint model: the simulator alone in the laboratory, effects in the field."""
+"""The forward model: hypotheses, form errors, discrepancies, shifts."""
 
 from __future__ import annotations
 
-from copy import copy
+import tomllib
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from calib.inference.sampling.mode import prior_widths
 
 from calib.data.quantities import role_of
-from calib.gap.campaigns import campaigns
-from calib.gap.discrepancy import shift_map
-from calib.gap.effects import EFFECTS, Effect
-from calib.gap.forward import FieldPrediction, Forward, fields_of_all
+from calib.errors import CalibError
+from calib.gap import discrepancy as module
+from calib.gap.campaigns import Campaigns, campaigns
+from calib.gap.constants import RADIUS_ERROR, SHIFT_DIFFERENCE
+from calib.gap.corrected import Corrected, load_corrected, predict_columns, save_corrected
+from calib.gap.describe import shifts as shift_sizes
+from calib.gap.discrepancy import ZERO_OF_SLIP, Discrepancy, another_soil, quantities
+from calib.gap.effects import EFFECTS
+from calib.gap.fit import Fit, Start, finished, truncated_fits
+from calib.gap.forward import Forward
+from calib.gap.gauss_newton import Residuals, residuals_of_all
 from calib.gap.hypotheses import (
     Hypothesis,
     effect_priors,
@@ -23,8 +31,11 @@ from calib.gap.hypotheses import (
     unknowns,
     with_residual_discrepancy,
 )
-from calib.inference.priors import Prior, Priors
-from tests.gap.cases import NOISE, campaigns_of, make_case
+from calib.gap.mixture import Mixture
+from calib.gap.noise import Noise
+from calib.inference.prior_files import default_priors
+from calib.models import MODELS as KNOWN
+from tests.gap.cases import MODELS, NOISE, campaigns_of, make_case
 from tests.gap.test_hypotheses import density_campaigns
 
 SIGMA = {o: NOISE[o] for o in ("drawbar_pull", "rut_depth")}
@@ -53,15 +64,6 @@ def test_shapes(data):
         for o in data.outputs:
             assert forward.lab(psi)[o.name].shape == (4, 30)
             assert forward.field(psi, data.view)[o.name].shape == (4, 27)
-
-
-def test_of_no_vectors_there_are_no_predictions(data):
-    forward = Forward(data, single(data, "lug_thrust"), SIGMA)
-    plain = {o.name: np.empty((0, 27)) for o in data.outputs}
-    found = forward.departed(np.empty((0, forward.n_dim)), data.view, plain)
-    assert {name: values.shape for name, values in found.items()} == {
-        o.name: (0, 27) for o in data.outputs
-    }
 
 
 def test_none_is_the_simulator_in_both_campaigns(data):
@@ -126,35 +128,6 @@ def test_a_pair_does_what_both_do(data):
     np.testing.assert_allclose(gap(both, sizes), expected, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["force_offset", "sensor_drift"])
-def test_an_instrument_adds_its_error_to_what_happens_whatever_that_is(data, name):
-    """Softening does not soften the offset of a load cell, though it is later in the alphabet.
-
-    So what goes when the fault is taken away is the same amount as of the fault alone.
-    """
-    fault, size = single(data, name), {"force_offset": 0.1, "sensor_drift": 0.2}[name]
-
-    def fields(h: Hypothesis) -> tuple[np.ndarray, np.ndarray]:
-        forward = Forward(data, h, SIGMA)
-        psi = centre(forward, 1)
-        for effect, part in zip(h.effects, forward.phi_slices, strict=True):
-            psi[:, part.start] += size if effect.name == name else 0.2
-        without = forward.without(psi, data.view, name)["drawbar_pull"]
-        return forward.field(psi, data.view)["drawbar_pull"], without
-
-    alone, simulator = fields(fault)
-    tried = 0
-    for happens, effect in split_testable(data)[0].items():
-        if effect.instrument or "pull" not in effect.outputs:
-            continue
-        full, without = fields(joined(fault, single(data, happens)))
-        if np.abs(without - simulator).max() < 1e-3:
-            continue  # of one pass there is no compaction by passes
-        np.testing.assert_allclose(full - without, alone - simulator, atol=1e-9, err_msg=happens)
-        tried += 1
-    assert tried > 4
-
-
 def test_form_error_scales_the_effect_and_nothing_else(data):
     forward = Forward(data, single(data, "lug_thrust"), SIGMA)
     (part,) = forward.form_slices["drawbar_pull"]
@@ -181,13 +154,6 @@ def test_other_conditions_use_the_same_references(data):
         np.testing.assert_allclose(part[o], whole[o][:, :5], rtol=1e-12)
 
 
-def test_every_single_effect_has_a_prior_for_each_parameter(data):
-    for h in singles(data, {n: EFFECTS[n] for n in ("lug_thrust", "rate_effect")}):
-        forward = Forward(data, h, SIGMA)
-        part = forward.phi_slices[0]
-        assert part.stop - part.start == len(h.effects[0].parameters)
-
-
 @pytest.mark.parametrize(
     ("effect", "sds"),
     [
@@ -205,53 +171,6 @@ def test_a_formula_is_trusted_less_along_some_directions(data, effect, sds):
         found = [p.scale for p in forward.priors.free[part]]
         # Where an effect does nothing there is nothing to depart from.
         assert found == pytest.approx(sds if o.role in EFFECTS[effect].outputs else [])
-
-
-def test_each_of_two_effects_departs_from_its_own_formula(data):
-    both = joined(single(data, "lug_thrust"), single(data, "sensor_drift"))
-    forward = Forward(data, both, SIGMA)
-    lugs, drift = forward.form_slices["drawbar_pull"]
-    assert [p.scale for p in forward.priors.free[lugs]] == pytest.approx([0.15, 0.1, 0.13])
-    psi = centre(forward)
-    for part, effect in zip(forward.phi_slices, both.effects, strict=True):
-        psi[:, part.start] = 0.1 if effect.name == "lug_thrust" else 0.2
-    straight = forward.field(psi, data.view)["drawbar_pull"]
-    without = {c: forward.without(psi, data.view, c)["drawbar_pull"] for c in forward.causes}
-    departed = psi.copy()
-    departed[:, lugs.start] = 0.5
-    found = forward.field(departed, data.view)["drawbar_pull"]
-    slip = forward.covariates.over(data.view, "slip")
-    of_lugs = (straight - without["lug_thrust"]) * 0.5 * slip
-    np.testing.assert_allclose(found - straight, of_lugs, atol=1e-12)
-    # What it does beside the other is what goes with it, whatever the other's formula.
-    assert np.abs(straight - without["sensor_drift"]).max() > 0.01
-    np.testing.assert_allclose(
-        found - forward.without(departed, data.view, "sensor_drift")["drawbar_pull"],
-        straight - without["sensor_drift"], atol=1e-12,
-    )  # fmt: skip
-    assert drift.stop - drift.start == (0 if not EFFECTS["sensor_drift"].form else 1)
-
-
-def test_an_effect_acts_on_the_outputs_it_names_alone(data):
-    class Wind(Effect):
-        name = "wind"
-        parameters = ("force",)
-        outputs = ("pull",)
-
-        def on_conditions(self, phi, output, conditions, view):
-            raised = {k: 1.01 * v for k, v in conditions.items()}
-            return raised if phi.any() else conditions
-
-        def on_output(self, phi, output, location, view):
-            return location + phi[:, :1]
-
-    priors = Priors((Prior("force", "kN", "", "", "", False, 0.0, 0.1),))
-    forward = Forward(data, Hypothesis("wind", (Wind(),), (priors,)), SIGMA)
-    psi = np.array([[p.loc for p in forward.priors.free]])
-    psi[0, forward.phi_slices[0]] = 0.2
-    full, plain = forward.field(psi, data.view), forward.simulator(psi, data.view)
-    np.testing.assert_array_equal(full["rut_depth"], plain["rut_depth"])
-    assert (full["drawbar_pull"] > plain["drawbar_pull"] + 0.1).all()
 
 
 def test_beyond_the_pressures_of_both_campaigns_the_pull_goes_on_straight(data):
@@ -291,7 +210,7 @@ def test_a_form_error_is_of_the_functions_it_is_named_for(data, effect, beyond):
         wider = {c: v.mean() + 1.4 * (v - v.mean()) for c, v in view.conditions.items()}
         wider["pass_number"] = view.conditions["pass_number"] * 3.0
         view = replace(view, conditions=wider)
-    slip, pressure = (forward.covariates.over(view, what) for what in ("slip", "pressure"))
+    slip, pressure = (forward.data.scaled(view, what) for what in ("slip", "pressure"))
     written = []
     if "slip" in acting.form:
         written += [slip, (3.0 * slip**2 - 1.0) / 2.0]
@@ -332,115 +251,6 @@ def test_without_a_cause_the_others_stay(data):
             np.testing.assert_allclose(neither[o], plain[o], rtol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "names", [("lug_thrust",), ("pressure_gauge_bias", "slip_zero_shift"),
-              ("load_transfer", "multipass_compaction", "sensor_drift")],
-)  # fmt: skip
-def test_what_is_added_by_conditions_serves_for_any_form_errors(data, names):
-    """Asked again with other form errors, as asked for the first time with them."""
-    forward = Forward(data, joined(*(single(data, n) for n in names)), SIGMA)
-    rng = np.random.default_rng(6)
-    psi = forward.priors.sample(rng, 5)
-    other = psi.copy()
-    for part in (s for o in forward.form_slices.values() for s in o):
-        other[:, part] = 0.3 * rng.standard_normal((5, part.stop - part.start))
-    plain = forward.simulator(psi, data.view)
-    departed = FieldPrediction([(forward, psi)], data.view, plain)
-    for form in (psi, other):
-        found, expected = departed.at([form]), forward.departed(form, data.view, plain)
-        for o in data.names:
-            np.testing.assert_array_equal(found[o], expected[o])
-    # Without what an effect adds: as by a formula that misrepresents it by all of its size.
-    last = len(names) - 1
-    found = departed.at([other], last)
-    expected = forward.without(other, data.view, names[last])
-    for o in data.names:
-        np.testing.assert_allclose(found[o], expected[o], rtol=1e-12, atol=1e-12)
-
-
-def test_of_several_that_are_asked_each_leaves_its_own_out(data):
-    one, other = single(data, "lug_thrust"), single(data, "force_offset")
-    both, shifted = joined(one, other), shifts(data)[0]
-    rng = np.random.default_rng(7)
-    asked = []
-    for h, n in ((both, 3), (one, 2), (shifted, 4), (both, 1)):
-        forward = Forward(data, h, SIGMA)
-        asked.append((forward, forward.priors.sample(rng, n)))
-    plain = asked[0][0].simulator(
-        np.concatenate([psi[:, : f.n_shared] for f, psi in asked]), data.view
-    )
-    kept = {o: v.copy() for o, v in plain.items()}
-    found = fields_of_all(asked, data.view, plain, {0: [0], 3: [0, 1]})
-    start = 0
-    without = (("force_offset",), (), (), both.name.split("+"))
-    for (f, psi), left_out in zip(asked, without, strict=True):
-        expected = f.without(psi, data.view, *left_out)
-        for o in data.names:
-            np.testing.assert_allclose(
-                found[o][start : start + len(psi)], expected[o], rtol=1e-12, atol=1e-12
-            )
-        start += len(psi)
-    for o in data.names:  # what was given is as it was
-        np.testing.assert_array_equal(plain[o], kept[o])
-
-
-def test_a_vector_stacks_the_parts_of_a_hypothesis_in_their_order(data):
-    """Simulators, effects, form errors by output, shifts, a free discrepancy, its threshold."""
-    lugs = single(data, "lug_thrust")
-    h = replace(
-        lugs, shift=0.25, smooth=3.0, smooth_outputs=("drawbar_pull",), smooth_over="passes"
-    )
-    lab_mode = {o.name: centre_of(o) for o in data.outputs}
-    forward = Forward(data, h, SIGMA, lab_mode)
-    _, sds = shift_map(data.outputs, "alone")
-    wanted = [(f"{o.name}.{p.name}", p.loc, p.scale) for o in data.outputs for p in o.priors.free]
-    assert forward.n_shared == len(wanted) == 13
-    wanted += [(f"lug_thrust.{p.name}", p.loc, p.scale) for p in lugs.effect_priors[0].free]
-    forms = (0.15, 0.1, 0.13)
-    wanted += [(f"{o}.lug_thrust.form", 0.0, sd) for o in data.names for sd in forms]
-    wanted += [("field.shift", 0.0, 0.25 * sd) for sd in sds]
-    # A constant, three cosines that tell four passes apart, and as many for a part of the pull.
-    waves = [0.8 / (1.0 + (j / 4.0) ** 2) for j in (1, 2, 3)]
-    sizes = [1.0, *waves, 0.5, *(0.6 * w for w in waves)]
-    wanted += [("drawbar_pull.smooth", 0.0, 3.0 * 0.03 * w) for w in sizes]
-    found = [(p.name, p.loc, p.scale) for p in forward.priors.entries]
-    assert [name for name, *_ in found] == [name for name, *_ in wanted]
-    for one, other in zip(found, wanted, strict=True):
-        assert one[1:] == pytest.approx(other[1:], rel=1e-12)
-    assert not any(p.log for p in forward.priors.entries if p.name.endswith(("form", "smooth")))
-    assert forward.n_dim == len(wanted)
-    parts = [
-        *forward.theta_slices.values(), *forward.phi_slices,
-        *(part for parts in forward.form_slices.values() for part in parts),
-        forward.shift_slice, *forward.smooth_slices.values(),
-    ]  # fmt: skip
-    assert np.concatenate([np.arange(forward.n_dim)[part] for part in parts]).tolist() == list(
-        range(forward.n_dim)
-    )
-
-
-def test_a_threshold_lies_within_the_campaign(data):
-    """On a scale of -1..1, with some rows on both of its sides."""
-    h = Hypothesis("unknown", smooth=4.0, smooth_outputs=("drawbar_pull",), onset_over="slip")
-    forward = Forward(data, h, SIGMA)
-    step, bend, before, threshold = forward.priors.entries[-4:]
-    sds = (step.scale, bend.scale, before.scale)
-    assert sds == pytest.approx((4.0 * 0.03, 4.0 * 0.03 * 2.0, 4.0 * 0.03 * 0.5))
-    assert (threshold.lower, threshold.upper) == (-0.85, 0.9)
-    assert threshold.loc == pytest.approx(0.025)
-    assert not np.isfinite(threshold.scale)
-    assert not threshold.log
-    assert forward.threshold == forward.n_dim - 1
-    psi = centre(forward, 3)
-    psi[:, -4:] = [[0.1, -0.2, 0.0, -0.4], [0.0, 0.3, 0.1, 0.0], [0.2, 0.1, -0.1, 0.6]]
-    gap = (forward.field(psi, data.view)["drawbar_pull"]
-           - forward.simulator(psi, data.view)["drawbar_pull"])  # fmt: skip
-    u = (forward.covariates.over(data.view, "slip") - psi[:, -1:]) / 0.06
-    step, bend = 1.0 / (1.0 + np.exp(-u)), 0.06 * np.logaddexp(0.0, u)
-    of_step, of_bend, before = psi[:, -4:-3], psi[:, -3:-2], psi[:, -2:-1]
-    np.testing.assert_allclose(gap, of_step * step + of_bend * bend + before, atol=1e-12)
-
-
 def test_of_density_a_simulator_is_inadequate_and_gauges_errors_have_forms():
     """Bends by the noise at the ends of the lab's range; sizes, cone index and water."""
     density = campaigns(density_campaigns())
@@ -455,40 +265,9 @@ def test_of_density_a_simulator_is_inadequate_and_gauges_errors_have_forms():
         forms = entries[f"bulk_density.{name}.form"]
         assert forms == [(0.0, 0.2), (0.0, 0.15), (0.0, 0.1)]
     # What the form errors multiply: one, cone index and water content on a scale of -1..1.
-    over = [forward.covariates.over(density.view, what) for what in ("cone", "water")]
+    over = [forward.data.scaled(density.view, what) for what in ("cone", "water")]
     for basis in forward.form(density.view):
         np.testing.assert_array_equal(basis, np.stack([np.ones(36), *over], axis=1))
-
-
-def test_an_emulators_error_is_standard_normal(data):
-    """Beside the inadequacy, of every simulator that has one."""
-    simulated = {name: copy(s) for name, s in data.simulated.items()}
-    simulated["rut_depth"].n_errors = 2
-    emulated = replace(data)
-    emulated.__dict__["simulated"] = simulated
-    forward = Forward(emulated, Hypothesis("none"), SIGMA)
-    found = [(p.name, p.loc, p.scale) for p in forward.priors.entries[forward.n_shared - 2 :]]
-    assert found == [("rut_depth.emulator", 0.0, 1.0)] * 2
-
-
-def test_lab_field_and_simulator_are_the_same_in_one_call_or_two(data):
-    lab_mode = {o.name: centre_of(o) for o in data.outputs}
-    for h in (
-        Hypothesis("none"), single(data, "slip_zero_shift"), shifts(data)[0], unknowns(data)[0],
-    ):  # fmt: skip
-        forward = Forward(data, h, SIGMA, lab_mode)
-        psi = centre(forward)
-        psi += 0.05 * np.random.default_rng(4).standard_normal(psi.shape)
-        lab, field = forward.lab(psi), forward.field(psi, data.view)
-        plain = forward.simulator(psi, data.view)
-        found = (*forward.campaigns(psi), *forward.field_and_plain(psi, data.view))
-        for one, other in zip((*found, *forward.plain(psi)), (lab, field, field, plain, lab, plain),
-                              strict=True):  # fmt: skip
-            assert set(one) == set(data.names)
-            for o in data.names:
-                np.testing.assert_allclose(one[o], other[o], rtol=1e-12)
-        if h.name != "none":
-            assert not np.allclose(field["drawbar_pull"], plain["drawbar_pull"], rtol=1e-4)
 
 
 @pytest.mark.parametrize("shift_as", ["alone", "soil"])
@@ -508,19 +287,6 @@ def test_a_shift_moves_the_parameters_and_the_zero_of_slip(data, shift_as):
         truly = conditions | {"slip_ratio": 1.0 - (1.0 - slip) * (1.0 - error)}
         expected = o.problem.bound.mean_response(o.priors.to_natural(t), truly)
         np.testing.assert_allclose(found[o.name], expected, rtol=1e-12)
-
-
-def test_what_knows_no_slip_does_not_mind_where_its_zero_is():
-    """A rut by plain Bekker, beside a pull that shows another zero of slip."""
-    case = make_case(models={"drawbar_pull": "magic_formula", "rut_depth": "bekker"})
-    both = campaigns(case)
-    forward = Forward(both, Hypothesis("parameter_shift", shift=0.25), SIGMA)
-    psi = centre(forward)
-    zero = forward.shift_slice.start + int(np.argmax(forward.shift.radius_error))
-    psi[:, zero] = 1.0
-    found, plain = forward.field(psi, both.view), forward.simulator(psi, both.view)
-    np.testing.assert_array_equal(found["rut_depth"], plain["rut_depth"])
-    assert not np.allclose(found["drawbar_pull"], plain["drawbar_pull"], rtol=1e-3)
 
 
 def test_form_errors_scale_what_each_effect_adds_to_those_before_it(data):
@@ -562,66 +328,393 @@ def test_form_errors_scale_what_each_effect_adds_to_those_before_it(data):
         np.testing.assert_allclose(found[o.name], location + added * factor[0], rtol=1e-10)
 
 
-class Along(Effect):
-    """An effect whose form is least certain along what it is given."""
-
-    name = "along"
-    form = ("shape",)
-    outputs = ("pull",)
-
-    def __init__(self, values) -> None:
-        self.values = np.array(values, float)
-
-    def shape(self, view):
-        return np.resize(self.values, view.slip().size)
-
-
-@pytest.mark.parametrize(
-    ("values", "basis"),
-    [
-        ([2.0, 6.0, 5.0], [-1.0, 1.0, 0.5]),
-        ([-6.0, -2.0, -3.0], [-1.0, 1.0, 0.5]),
-        ([0.0, 2e-9], [-1.0, 1.0]),
-        # What is constant to rounding is no covariate.
-        ([0.0, 1e-9], None),
-        ([3.0], None),
-    ],
-)
-def test_along_its_own_covariate_it_is_on_the_fields_scale(data, values, basis):
-    h = Hypothesis("along", (Along(values),), (Priors(()),))
-    forward = Forward(data, h, SIGMA)
-    (found,) = forward.form(data.view)
-    part = forward.form_slices["drawbar_pull"][0]
-    if basis is None:
-        assert found.shape == (27, 0)
-        assert part.stop == part.start
-    else:
-        np.testing.assert_allclose(found[:, 0], np.resize(basis, 27))
-        assert [p.scale for p in forward.priors.entries[part]] == [0.18]
-
-
-def test_beyond_the_field_the_form_of_an_effect_ends(data):
-    class OverSlip(Along):
-        def shape(self, view):
-            return view.slip()
-
-    h = Hypothesis("along", (OverSlip(()),), (Priors(()),))
-    slip = data.view.slip()
-    middle, half = 0.5 * (slip.max() + slip.min()), 0.5 * np.ptp(slip)
-    u = np.array([-9.0, -1.6, -1.4, -1.0, 0.5, 1.4, 1.6, 9.0])
-    elsewhere = data.at_conditions({"slip_ratio": middle + half * u})
-    (found,) = Forward(data, h, SIGMA).form(elsewhere)
-    np.testing.assert_allclose(found[:, 0], [-1.5, -1.5, -1.4, -1.0, 0.5, 1.4, 1.5, 1.5])
-
-
 def centre_of(output) -> np.ndarray:
     return np.array([p.loc for p in output.priors.free])
 
 
-def test_a_hypothesis_of_which_nothing_is_said_is_the_simulator():
-    """Of a free discrepancy waves fall off from the fourth; it varies with every condition."""
-    said = Hypothesis(
-        "none", effects=(), effect_priors=(), shift=0.0, shift_as="alone", smooth=0.0,
-        smooth_outputs=(), smooth_over="all", smooth_decay=4.0, onset_over=None, share=1.0,
+PULL = ("drawbar_pull",)
+
+
+@pytest.fixture(scope="module")
+def smooth() -> Campaigns:
+    return campaigns_of(None)
+
+
+def of(smooth: Campaigns, **kwargs) -> Discrepancy:
+    lab_mode = {o.name: np.array([p.loc for p in o.priors.free]) for o in smooth.outputs}
+    h = Hypothesis("unknown", smooth=1.0, smooth_outputs=PULL, **kwargs)
+    return Discrepancy(smooth, h, lab_mode)
+
+
+@pytest.mark.parametrize(
+    "over",
+    ["slip", "ripple", "level", "sinkage", "order", "pressure", "speed", "passes", "water", "all"],
+)
+def test_it_is_the_same_function_at_other_conditions(smooth, over):
+    found = of(smooth, smooth_over=over)
+    amplitudes = np.random.default_rng(1).standard_normal((3, found.sds("drawbar_pull").size))
+    whole = found.at(amplitudes, np.empty(0), smooth.view, "drawbar_pull")
+    rows = np.array([4, 0, 17])
+    some = replace(
+        smooth.view,
+        conditions={k: v[rows] for k, v in smooth.view.conditions.items()},
+    )
+    part = found.at(amplitudes, np.empty(0), some, "drawbar_pull")
+    np.testing.assert_allclose(part, whole[:, rows], atol=1e-12)
+
+
+def test_it_sets_in_at_a_threshold_as_a_step_and_a_bend_of_what_it_was_before(smooth):
+    found = of(smooth, onset_over="slip")
+    np.testing.assert_array_equal(found.sds("drawbar_pull"), [1.0, 2.0, 0.5])
+    u = found.onset_covariate(smooth.view, "drawbar_pull")
+    step, bend, before = found.onset(smooth.view, "drawbar_pull", np.array([0.1]))
+    far = abs(u - 0.1) > 0.6  # ten widths
+    np.testing.assert_allclose(step[0, far], (u > 0.1)[far], atol=1e-4)
+    np.testing.assert_allclose(bend[0, far], np.maximum(u - 0.1, 0.0)[far], atol=1e-4)
+    np.testing.assert_array_equal(before, 1.0)
+    all_three = found.at(np.array([[0.2, -0.3, 0.4]]), np.array([0.1]), smooth.view, "drawbar_pull")
+    np.testing.assert_allclose(all_three, 0.2 * step - 0.3 * bend + 0.4)
+
+
+def test_a_reading_that_keeps_part_of_the_run_before(smooth):
+    found = of(smooth, smooth_over="before")
+    o = next(o for o in smooth.outputs if o.name == "drawbar_pull")
+    theta = o.priors.to_natural(found.lab_mode["drawbar_pull"][None])
+    selected = o.problem.bound.model.select(smooth.view.conditions)
+    pull = o.problem.bound.mean_response(theta, selected)[0]
+    as_they_are = found.at(np.array([[0.3]]), np.empty(0), smooth.view, "drawbar_pull")[0]
+    np.testing.assert_allclose(np.sqrt(np.mean(as_they_are**2)), 0.3)
+    # The order of the runs counts, not that of the rows.
+    runs = np.random.default_rng(2).permutation(pull.size)
+    order = np.empty(pull.size)
+    order[runs] = np.arange(pull.size)
+    shuffled = replace(smooth.view, conditions={**smooth.view.conditions, "run_order": order})
+    gap = found.at(np.array([[0.3]]), np.empty(0), shuffled, "drawbar_pull")[0]
+    kept = gap[runs[1:]] / (pull[runs[:-1]] - pull[runs[1:]])
+    np.testing.assert_allclose(kept, kept[0])
+    assert kept[0] > 0.0
+    assert gap[runs[0]] == 0.0
+
+
+DECAY = 3.0
+
+
+def cosines(u: np.ndarray, most: int, scale: float) -> list[tuple[np.ndarray, float]]:
+    """cos(j pi (u + 1)/2) of rms about one, the less probable the shorter its waves."""
+    return [
+        (
+            np.sqrt(2.0) * np.cos(j * np.pi * (np.clip(u, -1.2, 1.2) + 1.0) / 2.0),
+            scale / (1.0 + (j / DECAY) ** 2),
+        )
+        for j in range(1, most + 1)
+    ]
+
+
+def written_again(found: Discrepancy, view, over: str) -> list[tuple[np.ndarray, float]]:
+    """The terms of a discrepancy of the pull: functions of the rows, and their sds."""
+    u = {
+        what: found.data.scaled(view, what)
+        for what in ("slip", "order", "pressure", "speed", "passes", "load")
+    }
+    levels = {
+        what: np.unique(values).size
+        for what in u
+        if (values := found.data.scaled(found.data.view, what)) is not None
+    }
+    one = [(np.ones(len(u["slip"])), 1.0)]
+    if over in ("level", "sinkage"):
+        name = "drawbar_pull" if over == "level" else "rut_depth"
+        o = next(o for o in found.data.outputs if o.name == name)
+        theta = o.priors.to_natural(found.lab_mode[name][None])
+
+        def predicted(at) -> np.ndarray:
+            return o.problem.bound.mean_response(
+                theta, o.problem.bound.model.select(at.conditions)
+            )[0]
+
+        reference = predicted(found.data.view)
+        level = 2.0 * (predicted(view) - reference.min()) / np.ptp(reference) - 1.0
+        return one + cosines(np.clip(level, -1.5, 1.5), 8, 0.8)
+    if over == "order":
+        return one + cosines(u["order"], 12, 0.7)
+    if over in ("pressure", "speed", "passes"):
+        terms = cosines(u[over], min(levels[over] - 1, 6), 0.8)
+        level = written_level(found, view)
+        return [*one, *terms, (level, 0.5), *((level * b, 0.6 * w) for b, w in terms)]
+    slips = cosines(u["slip"], 10, 0.7)
+    terms = list(slips)
+    if over == "all":
+        terms += cosines(u["order"], 6, 0.5)
+    bends = 2 if over == "all" else 1
+    for b, w in cosines(u["pressure"], min(levels["pressure"] - 1, bends), 0.5):
+        terms += [(b, w), *((b * s, w * v) for s, v in slips[:4])]
+    if over == "all":
+        for what in ("speed", "passes", "load"):
+            if u[what] is not None:
+                terms += [*cosines(u[what], 3, 0.4), (u[what] * u["slip"], 0.4)]
+    return one + terms
+
+
+def written_level(found: Discrepancy, view) -> np.ndarray:
+    o = next(o for o in found.data.outputs if o.name == "drawbar_pull")
+    theta = o.priors.to_natural(found.lab_mode["drawbar_pull"][None])
+    select = o.problem.bound.model.select
+    at, reference = (
+        o.problem.bound.mean_response(theta, select(v.conditions))[0]
+        for v in (view, found.data.view)
+    )
+    return np.clip(2.0 * (at - reference.min()) / np.ptp(reference) - 1.0, -1.5, 1.5)
+
+
+@pytest.mark.parametrize(
+    "over", ["slip", "level", "sinkage", "order", "pressure", "speed", "passes", "all"]
+)
+@pytest.mark.parametrize("beyond", [False, True])
+def test_terms_are_those_of_its_equations(smooth, over, beyond):
+    """At the field's conditions and beyond them; what the terms are, and how large they may be."""
+    found = of(smooth, smooth_over=over, smooth_decay=DECAY)
+    view = smooth.view
+    if beyond:
+        wider = {c: v.mean() + 1.3 * (v - v.mean()) for c, v in view.conditions.items()}
+        view = replace(view, conditions=wider)
+    terms = written_again(found, view, over)
+    sds = found.sds("drawbar_pull")
+    np.testing.assert_allclose(sds, [w for _, w in terms])
+    basis = found.at(np.eye(sds.size), np.empty(0), view, "drawbar_pull")
+    np.testing.assert_allclose(basis, [b for b, _ in terms], atol=1e-12)
+
+
+def test_below_a_pressure_it_is_a_step_and_a_part_of_the_pull(smooth):
+    found = of(smooth, onset_over="low_pressure")
+    psi = smooth.view.conditions["inflation_pressure_psi"]
+    step, part = found.onset(smooth.view, "drawbar_pull", np.array([0.0]))
+    # On a scale on which 18 psi is 1 and 42 psi is -1; half way at its threshold.
+    np.testing.assert_allclose(step[0, psi < 20.0], 1.0, atol=1e-6)
+    np.testing.assert_allclose(step[0, psi > 40.0], 0.0, atol=1e-6)
+    level = written_level(found, smooth.view)
+    np.testing.assert_allclose(part, step * level)
+    u = found.onset_covariate(smooth.view, "drawbar_pull")
+    there = found.onset(smooth.view, "drawbar_pull", u[:1])
+    assert there[0][0, 0] == pytest.approx(0.5)
+
+
+NOISE_SD = {o: NOISE[o] for o in MODELS}
+SIZE = 0.25
+
+
+def drawn_shifts(data, shift_as) -> dict[str, np.ndarray]:
+    """Shifts of each parameter in units of its prior sd, drawn from the prior."""
+    forward = Forward(data, Hypothesis("parameter_shift", shift=SIZE, shift_as=shift_as), NOISE_SD)
+    psi = forward.priors.sample(np.random.default_rng(1), 40_000)[:, forward.shift_slice]
+    shift = forward.shift
+    assert shift is not None
+    return {
+        name: (psi @ shift.parameters[o.name].T)[:, i] / width
+        for o in data.outputs
+        for i, (name, width) in enumerate(zip(o.priors.names, prior_widths(o.priors), strict=True))
+    } | {ZERO_OF_SLIP: psi @ shift.radius_error / RADIUS_ERROR}
+
+
+def test_alone_all_pressures_change_alike_and_shapes_less(data):
+    drawn = drawn_shifts(data, "alone")
+    sds = {name: float(values.std()) for name, values in drawn.items()}
+    assert sds["D_lo"] == pytest.approx(SIZE * np.hypot(1.0, SHIFT_DIFFERENCE), rel=0.03)
+    assert sds["z_ref"] == pytest.approx(SIZE, rel=0.03)
+    assert sds[ZERO_OF_SLIP] == pytest.approx(SIZE, rel=0.03)
+    for name in ("K_bend", "D_bend", "G_bend", "n1"):
+        assert sds[name] == pytest.approx(SIZE * SHIFT_DIFFERENCE, rel=0.03)
+    between = float(np.corrcoef(drawn["D_lo"], drawn["D_hi"])[0, 1])
+    d2 = SHIFT_DIFFERENCE**2
+    assert between == pytest.approx((1.0 - d2) / (1.0 + d2), abs=0.01)
+    assert np.corrcoef(drawn["D_lo"], drawn["z_ref"])[0, 1] == pytest.approx(0.0, abs=0.02)
+
+
+def test_with_another_soil_they_covary_as_the_prior_file_says(data):
+    file = tomllib.loads(default_priors("shifts/another_soil").read_text())["parameters"]
+    ways = {name: np.array(row["ways"]) for name, row in file.items()}
+    drawn = drawn_shifts(data, "soil")
+    shared = {
+        "K": 0.5 * (drawn["K_lo"] + drawn["K_hi"]),
+        "K_difference": 0.5 * (drawn["K_hi"] - drawn["K_lo"]),
+        "D": 0.5 * (drawn["D_lo"] + drawn["D_hi"]),
+        "z_ref": drawn["z_ref"],
+        "n0": drawn["n0"],
+        "n1": drawn["n1"],
+        ZERO_OF_SLIP: drawn[ZERO_OF_SLIP],
+    }
+    for a, x in shared.items():
+        for b, y in shared.items():
+            expected = ways[a] @ ways[b] + (file[a]["own"] ** 2 if a == b else 0.0)
+            scale = x.std() * y.std()
+            assert np.mean(x * y) == pytest.approx(SIZE**2 * expected, abs=0.03 * scale), (a, b)
+
+
+def test_a_softer_soil_gives_less_pull_and_deeper_ruts(data):
+    drawn = drawn_shifts(data, "soil")
+    assert np.corrcoef(drawn["D_lo"], drawn["z_ref"])[0, 1] < -0.2
+    assert np.corrcoef(drawn["K_lo"], drawn["D_lo"])[0, 1] > 0.3
+
+
+def test_the_prior_names_quantities_of_the_models_and_says_where_it_comes_from():
+    known = {q for m in KNOWN.values() for q in quantities(m.parameters)}
+    assert set(another_soil()) <= known | {ZERO_OF_SLIP}
+    content = tomllib.loads(default_priors("shifts/another_soil").read_text())
+    for key in ("unit", "reason", "source"):
+        assert len(content[key]) > 5
+    assert len(content["ways"]) == len(next(iter(another_soil().values()))[0])
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("ways = [", "cannot be read"),
+        ('unit = "1"\nreason = "x"\nsource = "y"\nways = []\n', "cannot be read"),
+        (
+            'unit = "1"\nreason = "x"\nsource = "y"\nways = ["a", "b"]\n'
+            "[parameters.K]\nways = [1.0]\nown = 0.5\n",
+            "as many loadings",
+        ),
+    ],
+)
+def test_a_damaged_prior_is_refused(tmp_path, monkeypatch, text, said):
+    (tmp_path / "another_soil.toml").write_text(text)
+    monkeypatch.setattr(module, "default_priors", lambda _: tmp_path / "another_soil.toml")
+    with pytest.raises(CalibError, match=said):
+        another_soil()
+
+
+def fitted(data) -> Fit:
+    """A soil that shifted by one sd of its first coordinate."""
+    forward = Forward(data, Hypothesis("parameter_shift", shift=SIZE, shift_as="soil"), NOISE_SD)
+    psi = np.array([p.loc for p in forward.priors.free])
+    psi[forward.shift_slice.start] = SIZE
+    noise = {o: Noise(s) for o, s in NOISE_SD.items()}
+    return Fit(forward, psi, 1e-4 * np.eye(psi.size), noise, 0.0, 0.0, {})
+
+
+def test_the_page_tells_the_shift_of_each_parameter_not_of_a_coordinate(data):
+    fit = fitted(data)
+    shift = fit.forward.shift
+    assert shift is not None
+    matrix = shift.parameters["drawbar_pull"]
+    names = data.outputs[0].priors.names
+    found = {p.name: p for p in shift_sizes(data.outputs, fit)}
+    for name in ("K_lo", "K_hi"):
+        i = names.index(name)
+        value = 100.0 * np.expm1(SIZE * matrix[i, 0])
+        assert found[name].mean == pytest.approx(value, rel=0.06)
+        assert found[name].unit == "percent"
+
+
+def test_a_shifted_soil_is_saved_and_loaded(data, tmp_path):
+    fit = fitted(data)
+    mode = {o.name: np.array([p.loc for p in o.priors.free]) for o in data.outputs}
+    corrected = Corrected(Mixture(data, (fit,), (1.0,), 3), mode)
+    save_corrected(corrected, tmp_path)
+    loaded = load_corrected(tmp_path)
+    assert loaded.mixture.fits[0].forward.hypothesis.shift_as == "soil"
+    before, after = (predict_columns(c, data.case.field) for c in (corrected, loaded))
+    for name in (n for n in before if "_before" in n or "_after" in n):
+        np.testing.assert_allclose(after[name], before[name], rtol=1e-9)
+
+
+def test_another_table_since_does_not_change_a_saved_model(data, tmp_path, monkeypatch):
+    fit = fitted(data)
+    mode = {o.name: np.array([p.loc for p in o.priors.free]) for o in data.outputs}
+    corrected = Corrected(Mixture(data, (fit,), (1.0,), 3), mode)
+    save_corrected(corrected, tmp_path)
+    before = predict_columns(corrected, data.case.field)
+    table = {name: (3.0 * ways, own) for name, (ways, own) in another_soil().items()}
+    monkeypatch.setattr(module, "another_soil", lambda: table)
+    after = predict_columns(load_corrected(tmp_path), data.case.field)
+    for name in (n for n in before if "_before" in n or "_after" in n):
+        np.testing.assert_allclose(after[name], before[name], rtol=1e-9)
+
+
+@pytest.mark.parametrize("shift_as", ["alone", "soil"])
+def test_another_zero_of_slip_is_a_wrong_rolling_radius(data, shift_as):
+    shifted = Forward(data, Hypothesis("parameter_shift", shift=SIZE, shift_as=shift_as), NOISE_SD)
+    assert shifted.shift is not None
+    psi = np.array([[p.loc for p in shifted.priors.free]])
+    # Coordinates that shift the zero of slip and no parameter.
+    all_rows = np.concatenate(
+        [*shifted.shift.parameters.values(), shifted.shift.radius_error[None]]
+    )
+    only = np.linalg.solve(all_rows, np.eye(len(all_rows))[-1])
+    psi[0, shifted.shift_slice] = 0.04 * only
+    (wrong,) = singles(data, {"slip_zero_shift": EFFECTS["slip_zero_shift"]})
+    known = Forward(data, wrong, NOISE_SD)
+    other = np.array([[p.loc for p in known.priors.free]])
+    other[0, known.phi_slices[0]] = 0.04
+    found, expected = (f.field(x, data.view) for f, x in ((shifted, psi), (known, other)))
+    for name, values in expected.items():
+        np.testing.assert_allclose(found[name], values, rtol=1e-9)
+        assert not np.allclose(values, shifted.simulator(psi, data.view)[name], rtol=1e-3)
+
+
+@pytest.fixture(scope="module")
+def gauged() -> Campaigns:
+    return campaigns(make_case("force_offset", size={"offset": 0.12}))
+
+
+@pytest.fixture(scope="module")
+def problems(gauged) -> list[Residuals]:
+    """One of every kind: none, shift, effects on conditions and outputs, free discrepancies."""
+    effects = {h.name: h for h in singles(gauged, split_testable(gauged)[0])}
+    free = unknowns(gauged)
+    onset = next(h for h in free if h.onset_over is not None)
+    gauge, lugs = effects["pressure_gauge_bias"], effects["lug_thrust"]
+    alone, soil = shifts(gauged)[:2]
+    assert alone.shift_as != soil.shift_as
+    kinds = (
+        Hypothesis("none"), alone, gauge, lugs, joined(gauge, lugs), free[0], onset, soil,
     )  # fmt: skip
-    assert Hypothesis("none") == said
+    mode = {o.name: np.array([p.loc for p in o.priors.free]) for o in gauged.outputs}
+    return [Residuals(gauged, Forward(gauged, h, SIGMA, mode)) for h in kinds]
+
+
+def drawn(problem: Residuals, size: int) -> np.ndarray:
+    """Points about the middle of the priors."""
+    rng = np.random.default_rng(7)
+    middle = problem.clip(np.array([p.loc for p in problem.forward.priors.free]))
+    middle = np.where(np.isfinite(middle), middle, 0.0)
+    steps = 0.1 * problem.width * rng.standard_normal((size, middle.size))
+    return problem.clip(middle + steps)
+
+
+def test_all_at_once_have_the_residuals_of_each_alone(problems):
+    # More points than are evaluated at once, so that there are several batches.
+    asked = [(p, drawn(p, 400)) for p in problems]
+    found = residuals_of_all(asked)
+    assert len(found) == len(problems)
+    for (problem, psi), raw in zip(asked, found, strict=True):
+        alone = problem.raw(psi)
+        assert np.isfinite(alone).mean() > 0.9
+        np.testing.assert_allclose(raw, alone, rtol=1e-9, atol=1e-12)
+
+
+def test_each_effect_is_asked_once_for_all_hypotheses_that_have_it(gauged):
+    """Whatever conditions those before it have changed in some of them and in others not."""
+    one = singles(gauged, split_testable(gauged)[0])
+    both = [joined(a, b) for i, a in enumerate(one) for b in one[i + 1 :]]
+    asked = []
+    for h in (*one, *both):
+        problem = Residuals(gauged, Forward(gauged, h, SIGMA))
+        asked.append((problem, drawn(problem, 2)))
+    for (problem, psi), raw in zip(asked, residuals_of_all(asked), strict=True):
+        np.testing.assert_allclose(raw, problem.raw(psi), rtol=1e-9, atol=1e-12)
+
+
+def test_hypotheses_in_step_end_where_each_alone_does(problems):
+    noise = {o: Noise(s) for o, s in SIGMA.items()}
+
+    def fitted(chosen: list[Residuals]) -> list[Fit]:
+        starts = [drawn(p, 8) for p in chosen]
+        begun = [Start(p.forward, s, noise, 3) for p, s in zip(chosen, starts, strict=True)]
+        return finished(truncated_fits(begun))
+
+    for problem, found in zip(problems, fitted(problems), strict=True):
+        (alone,) = fitted([problem])
+        assert found.forward.hypothesis is problem.forward.hypothesis
+        # Both stop within a hundredth of a nat of the mode.
+        assert found.log_evidence == pytest.approx(alone.log_evidence, abs=0.01)

@@ -158,87 +158,6 @@ def test_an_effect_that_cannot_be_evaluated_is_refused(tmp_path, code, words):
     assert "mine.py, effect cross_wind" in str(caught.value)
 
 
-BASES = """
-from calib.gap.effects import Effect
-
-
-class _Far(Effect):
-    FAR
-
-
-class _Near(_Far):
-    pass
-
-
-class CrossWind(_Near):
-"""
-
-
-@pytest.mark.parametrize(
-    ("far", "fine"),
-    [
-        ("pass", True), ("_gusts = 3.0", True), ("gusts = 3.0", True),
-        ("def on_ouput(self):\n        pass", False), ('ouputs = ("pull",)', False),
-    ],
-)  # fmt: skip
-def test_what_an_effect_inherits_is_checked_as_well(tmp_path, far, fine):
-    """However far up, but for what every effect has."""
-    own = CODE.partition("class CrossWind(Effect):\n")[2]
-    path = write(tmp_path, BASES.replace("FAR", far) + own)
-    if fine:
-        assert load_effects(path)["cross_wind"].outputs == ("pull",)
-    else:
-        with pytest.raises(CalibError, match="is none of an effect's"):
-            load_effects(path)
-
-
-@pytest.mark.parametrize(
-    ("form", "said"),
-    [
-        ('conditions | {"slip": conditions["slip"] + 0.01 * phi[:, :1]}', None),
-        ('conditions | {"slip": conditions["slip"] + 0.01}', None),
-        ('conditions | {"slip": phi[:, :1]}', "on_conditions, slip returned"),
-        ('conditions | {"slip": conditions["slip"][None, :]}', "on_conditions, slip returned"),
-        ('conditions | {"slip": conditions["slip"].astype(str)}', "on_conditions, slip returned"),
-        ('conditions | {"slip": conditions["slip"].tolist()}', "on_conditions, slip returned"),
-        ("dict(conditions)", "it changes nothing on this case"),
-    ],
-)
-def test_conditions_may_be_changed_by_draws_or_by_rows(tmp_path, form, said):
-    """One value for each row, or for each draw and row; nothing else."""
-    code = CODE.replace(
-        RETURN,
-        "        return location\n\n    def on_conditions(self, phi, output, conditions, view):\n"
-        f'        return {form} if "slip" in conditions else conditions\n',
-    )
-    effects, case = load_effects(write(tmp_path, code)), make_case("force_offset")
-    if said is None:
-        check_effects(effects, case)
-    else:
-        with pytest.raises(CalibError, match=said):
-            check_effects(effects, case)
-
-
-@pytest.mark.parametrize("form", ["(location > 0.0)", "location.astype(complex)"])
-def test_an_output_is_numbers(tmp_path, form):
-    path = write(tmp_path, CODE.replace("location + phi[:, :1]", form))
-    with pytest.raises(CalibError, match="on_output for drawbar_pull returned an array of"):
-        check_effects(load_effects(path), make_case("force_offset"))
-
-
-@pytest.mark.parametrize(
-    "form",
-    [
-        # No value in some rows, as where it is not known; a change where there is none otherwise.
-        "np.where(view.slip() > 0.3, location + phi[:, :1], np.nan)",
-        "np.where(view.slip() > 0.3, location, location + phi[:, :1])",
-    ],
-)
-def test_an_effect_may_be_of_some_rows(tmp_path, form):
-    code = "import numpy as np\n" + CODE.replace("location + phi[:, :1]", form)
-    check_effects(load_effects(write(tmp_path, code)), make_case("force_offset"))
-
-
 @pytest.mark.parametrize(
     ("sign", "kept", "broken"),
     [(1, "abs(phi[:, :1])", "phi[:, :1] - 1.0"), (-1, "-abs(phi[:, :1])", "phi[:, :1] + 1.0"),
@@ -305,16 +224,6 @@ def test_an_effect_that_a_case_cannot_show_is_not_tried(tmp_path):
 def test_a_good_effect_passes_the_trial(tmp_path):
     path = write(tmp_path)
     check_effects(load_effects(path), make_case("force_offset"))
-
-
-def test_wrong_priors_in_the_class_are_looked_for_there(tmp_path):
-    own = REGISTERED.replace("[parameters.force]", "[parameters.gust]")
-    path = write(tmp_path, own, None)
-    with pytest.raises(CalibError, match="unknown parameter gust") as caught:
-        check_effects(load_effects(path), make_case("force_offset"))
-    assert "mine.py, priors of the effect cross_wind, [parameters]" in str(caught.value)
-    assert "cross_wind.toml" not in str(caught.value)
-    assert "shipped" not in str(caught.value)
 
 
 REGISTERED = "import calib\n" + CODE.replace(

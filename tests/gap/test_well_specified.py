@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import csv
-import io
 import json
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-import calib.gap.well_specified as module
 from calib.errors import CalibError
 from calib.gap.batch import case_folders, diagnose_cases
 from calib.gap.campaigns import campaigns
 from calib.gap.case import read_case
-from calib.gap.noise import Noise, noise_conditions
+from calib.gap.noise import Noise
 from calib.gap.ranking import calibrate_lab
 from calib.gap.well_specified import SIZE_RATIO, draw_from_hypothesis, well_specified_case
 from challenge.files import OUTPUT_COLUMNS
@@ -150,133 +147,6 @@ def draw(truth: str, size: float, seed: int = 1):
     for name, part in found.forward.theta_slices.items():
         np.testing.assert_array_equal(found.psi[:, part], mode[name][None])
     return data, found
-
-
-def gaps(data, forward, psi, *without: str) -> np.ndarray:
-    """What goes with some causes, or all, in noise sds over field rows and outputs."""
-    full = forward.field(psi, data.view)
-    other = forward.without(psi, data.view, *without) if without else forward.simulator(
-        psi, data.view)  # fmt: skip
-    at = noise_conditions(data.view)
-    return {o: (full[o] - other[o])[0] / LAB[o].sd(at) for o in data.names}
-
-
-@pytest.mark.parametrize("seed", [1, 2, 3])
-@pytest.mark.parametrize("truth", ["force_offset", "parameter_shift", "unknown"])
-def test_what_is_drawn_has_the_size_that_it_says_and_that_was_asked_for(truth, seed):
-    data, found = draw(truth, 4.0, seed)
-    assert found.psi.shape == (1, found.forward.n_dim)
-    assert found.forward.hypothesis.name == truth
-    z = np.concatenate(list(gaps(data, found.forward, found.psi).values()))
-    assert found.gap_over_noise == pytest.approx(np.sqrt(np.square(z).mean()))
-    assert 4.0 / 1.25 < found.gap_over_noise < 4.0 * 1.25
-
-
-def test_the_key_says_what_each_cause_adds(tmp_path):
-    folder = write_case(make_case(None, n_fresh=5), tmp_path / "design")
-    _, key = well_specified_case(3, folder, "force_offset+rut_rebound", 5.0)
-    truth, without = (
-        {o: np.array(v) for o, v in key[k].items()} for k in ("field_truth", "field_without")
-    )
-    sd = {o: np.array(v) for o, v in key["noise_sd"].items()}
-    # Each acts on an output of its own; those of ruts live on the logarithm.
-    pull = (truth["drawbar_pull"] - without["drawbar_pull"]) / sd["drawbar_pull"]
-    relative = sd["rut_depth"] / truth["rut_depth"]
-    rut = np.log(truth["rut_depth"] / without["rut_depth"]) / relative
-    assert key["contributions"] == pytest.approx(
-        {
-            name: np.sqrt(np.square(z).mean() / 2.0)
-            for name, z in (("force_offset", pull), ("rut_rebound", rut))
-        }
-    )
-    _, key = well_specified_case(3, folder, "unknown", 5.0)
-    assert key["contributions"] == {}
-
-
-def test_without_a_gap_one_vector_is_drawn():
-    data, found = draw("none", 4.0)
-    assert found.gap_over_noise == 0.0
-    assert found.psi.shape == (1, found.forward.n_dim)
-    assert not any(z.any() for z in gaps(data, found.forward, found.psi).values())
-
-
-@pytest.mark.parametrize(
-    "truth", ["force_offset+rut_rebound", "force_offset+rut_rebound+slip_zero_shift"]
-)
-def test_of_several_each_is_large_enough_to_count(truth):
-    for seed in range(2):
-        data, found = draw(truth, 2.0, seed)
-        assert found.forward.hypothesis.name == truth
-        for cause in truth.split("+"):
-            each = gaps(data, found.forward, found.psi, cause)
-            assert max(np.sqrt(np.square(z).mean()) for z in each.values()) >= 1.0
-
-
-def test_a_size_that_no_draw_has_is_refused(monkeypatch):
-    monkeypatch.setattr(module, "_TRIES", 2)
-    with pytest.raises(CalibError, match=r"no force_offset of 1000000\.0 noise sds in 8000 draws"):
-        draw("force_offset", 1e6)
-
-
-def test_kinds_of_shifts_are_drawn_as_often_as_their_share(monkeypatch):
-    monkeypatch.setattr(
-        module, "shifts", lambda data: [SimpleNamespace(name=n, share=s) for n, s in
-                                        (("a", 0.1), ("b", 0.3))],
-    )  # fmt: skip
-    rng = np.random.default_rng(1)
-    found = [module._hypothesis(None, "parameter_shift", rng).name for _ in range(1000)]
-    assert found.count("b") == pytest.approx(750, abs=5 * np.sqrt(1000 * 0.75 * 0.25))
-
-
-def test_readings_and_key_of_a_case_are_those_of_its_draw(tmp_path):
-    folder = write_case(make_case(None, n_fresh=5), tmp_path / "design")
-    files, key = well_specified_case(3, folder, "force_offset", 5.0)
-    assert set(files) == {"case.toml", "lab.csv", "field.csv", "fresh.csv"}
-    for name in ("case.toml", "fresh.csv"):
-        assert files[name].rstrip() == (folder / name).read_text().rstrip()
-    truth, without = (
-        {o: np.array(v) for o, v in key[k].items()} for k in ("field_truth", "field_without")
-    )
-    offset = truth["drawbar_pull"] - without["drawbar_pull"]
-    assert np.ptp(offset) == pytest.approx(0.0, abs=1e-9)
-    assert truth["rut_depth"].tolist() == without["rut_depth"].tolist()
-    fresh = np.array(key["fresh_truth"]["drawbar_pull"]) - key["fresh_without"]["drawbar_pull"]
-    np.testing.assert_allclose(fresh, offset[0])
-    assert fresh.size == 5
-    _, noise = calibrate_lab(campaigns(read_case(folder)), 3)
-    sd = {o: np.array(v) for o, v in key["noise_sd"].items()}
-    np.testing.assert_allclose(sd["drawbar_pull"], noise["drawbar_pull"].sigma)
-    np.testing.assert_allclose(sd["rut_depth"], noise["rut_depth"].sigma * truth["rut_depth"])
-    relative = offset[0] / noise["drawbar_pull"].sigma * np.sqrt(0.5)
-    assert key["gap_over_noise"] == pytest.approx(abs(relative))
-    assert "force_offset" in key["mechanism"]
-    z = []
-    for file in ("lab", "field"):
-        rows = list(csv.DictReader(io.StringIO(files[f"{file}.csv"])))
-        was = cells(folder / f"{file}.csv")
-        assert files[f"{file}.csv"].endswith("\n")
-        assert len(rows) == len(was)
-        for one, other in zip(rows, was, strict=True):
-            changed = {c for c in one if one[c] != other[c]}
-            assert changed == {"drawbar_pull_kn", "rut_depth_mm"}
-            # Six digits.
-            assert all(len(one[c].replace(".", "").lstrip("-0")) <= 6 for c in changed)
-        if file == "field":
-            pull, rut = (np.array([float(r[c]) for r in rows])
-                         for c in ("drawbar_pull_kn", "rut_depth_mm"))  # fmt: skip
-            z.append((pull - truth["drawbar_pull"]) / sd["drawbar_pull"])
-            z.append(np.log(rut / truth["rut_depth"]) / noise["rut_depth"].sigma)
-        else:
-            mode, _ = calibrate_lab(campaigns(read_case(folder)), 3)
-            for o in campaigns(read_case(folder)).outputs:
-                at = o.problem.bound.mean_response(
-                    o.priors.to_natural(mode[o.name][None]), o.problem.conditions
-                )[0]
-                read = np.array([float(r[OUTPUT_COLUMNS[o.name]]) for r in rows])
-                z.append((o.problem.bound.to_response(read) - at) / noise[o.name].sigma)
-    z = np.concatenate(z)
-    assert abs(z.mean()) < 4.0 / np.sqrt(z.size)
-    assert abs(z.var() - 1.0) < 4.0 * np.sqrt(2.0 / z.size)
 
 
 def test_a_design_without_new_conditions_is_refused(tmp_path):

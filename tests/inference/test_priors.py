@@ -22,7 +22,7 @@ from calib.inference.priors import Prior, Priors, prior_references
 from calib.models import MODELS
 
 ENTRY = '[parameters.{name}]\nunit = "1"\nreason = "a test"\nsource = "nobody"\n'
-# Of single parameters; how parameters move together is of another form (tests/gap/test_shifts.py).
+# Of single parameters; how parameters move together is of another form (tests/gap/test_forward.py).
 PRIOR_FILES = sorted(
     p
     for p in Path(__file__).resolve().parents[2].joinpath("priors").rglob("*.toml")

@@ -9,14 +9,21 @@ prior file of its name.
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cache
+from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from calib.data.quantities import QUANTITIES, columns_of
 from calib.models.base import Array
+
+# Conditions of a model by physical role, each of shape (n,) or (k, n).
+type Conditions = dict[str, Array]
 
 
 @dataclass(frozen=True)
@@ -98,10 +105,7 @@ class View:
 
     def with_base(self, base: Mapping[str, Array]) -> View:
         """Return the same campaign with other predictions."""
-        # Fits do this a thousand times: `dataclasses.replace` takes five times as long.
-        other = object.__new__(type(self))
-        vars(other).update(vars(self), base=base)
-        return other
+        return replace(self, base=base)
 
     def slip(self) -> Array:
         """Recorded slip (fraction), zero where it is not recorded, shape (n,)."""
@@ -115,6 +119,18 @@ class View:
         if "sinkage" in self.base:
             return self.base["sinkage"] / 30.0
         return (1.0 + np.maximum(self.slip(), 0.0))[None, :]
+
+
+@cache
+def _words() -> dict[str, dict[str, Any]]:
+    text = files("calib.gap.effects").joinpath("words.toml").read_text(encoding="utf-8")
+    return tomllib.loads(text)
+
+
+def words(name: str) -> tuple[str, tuple[str, ...], str]:
+    """Return title, equations and check of a shipped effect."""
+    found = _words()[name]
+    return found["title"], tuple(found["latex"]), found.get("check", "zero and span")
 
 
 def each(phi: Array) -> Array:
@@ -199,12 +215,8 @@ class Effect:
     prior_file: Path | None = None
 
     def on_conditions(
-        self,
-        phi: Array,
-        output: str,
-        conditions: dict[str, Array],
-        view: View,
-    ) -> dict[str, Array]:
+        self, phi: Array, output: str, conditions: Conditions, view: View
+    ) -> Conditions:
         """Return the conditions that truly held, each of shape (n,) or (k, n).
 
         Parameters

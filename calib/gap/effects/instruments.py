@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from calib.gap.effects.base import Effect, View, each, saturating
+from calib.gap.effects.base import Conditions, Effect, View, each, saturating, words
 from calib.models.base import Array
 
 EARLY = "zero and span, and an early run once more"
@@ -24,35 +24,26 @@ class SlipZeroShift(_Fault):
     """A rolling radius wrong by a factor: 1 - s_true = (1 - s_recorded)(1 - error)."""
 
     name = "slip_zero_shift"
-    check = (
-        "the rolling radius once more, at each pressure; above zero the recorded radius is too "
-        "small"
-    )
+    title, latex, check = words(name)
     form = ("pressure",)  # a tyre rolls on a smaller radius at less inflation
-    title = "the rolling radius behind the recorded slip is wrong"
-    latex = (r"$1 - s_\mathrm{f} = (1 - s)(1 - \text{radius error})$ for the slip $s$",)
     parameters = ("radius_error",)
     outputs = ("pull", "sinkage")
     covariates = ("slip",)
     varies = False
 
-    def on_conditions(
-        self, phi: Array, output: str, conditions: dict[str, Array], view: View
-    ) -> dict[str, Array]:
+    def on_conditions(self, phi: Array, output: str, given: Conditions, view: View) -> Conditions:
         """Shift the slip."""
-        if "slip" not in conditions:
-            return conditions
-        return {**conditions, "slip": 1.0 - (1.0 - conditions["slip"]) * (1.0 - phi)}
+        if "slip" not in given:
+            return given
+        return {**given, "slip": 1.0 - (1.0 - given["slip"]) * (1.0 - phi)}
 
 
 class ForceOffset(_Fault):
     """A constant error of the drawbar reading."""
 
     name = "force_offset"
+    title, latex, check = words(name)
     device = "load cell"
-    check = "zero and span; above zero it reads too much"
-    title = "the drawbar reading is off by a constant"
-    latex = (r"$P_\mathrm{f} = P + \text{offset}$ for the pull $P$",)
     parameters = ("offset",)
     outputs = ("pull",)
 
@@ -82,16 +73,8 @@ class SensorDrift(_Fault):
     """A drift with run order: steady, settling, or from some run on; zeroed at any part of it."""
 
     name = "sensor_drift"
+    title, latex, check = words(name)
     device = "load cell"
-    check = f"{EARLY}; above zero it reads too much"
-    title = "the drawbar reading drifts with run order"
-    latex: tuple[str, ...] = (
-        r"$P_\mathrm{f} = P + \text{drift}\,[g(u) - \text{zero at}]$ for the pull $P$",
-        (
-            r"$g(u) = (1 + h^c)\, u^c / (u^c + h^c)$, $u$ being the part of the campaign that is "
-            r"over, $c$ the curvature and $h$ half way"
-        ),
-    )
     parameters = ("drift", "curvature", "half_way", "zero_at")
     form = ("shape",)
     outputs = ("pull",)
@@ -136,16 +119,8 @@ class SensorStep(_Fault):
     """
 
     name = "sensor_step"
+    title, latex, check = words(name)
     device = "load cell"
-    check = f"{EARLY}; above zero it reads too much"
-    title = "the drawbar reading jumps at some run, as when a sensor is replaced or slips"
-    latex: tuple[str, ...] = (
-        r"$P_\mathrm{f} = P + \text{jump}\,[H(u) - \text{zero at}]$ for the pull $P$",
-        (
-            r"$H(u)$ rises from 0 to 1 about the change point, during one run and the duration, "
-            r"$u$ being the part of the campaign that is over"
-        ),
-    )
     parameters = ("jump", "zero_at", "change_point", "duration")
     outputs = ("pull",)
     covariates = ("order",)
@@ -187,44 +162,27 @@ class PressureGaugeBias(_Fault):
     """
 
     name = "pressure_gauge_bias"
-    check = "against another gauge, at each pressure; above zero there is more than it reads"
+    title, latex, check = words(name)
     form = ("extrapolation",)  # the simulator is used at pressures it was not fitted at
-    title = "true inflation pressure differs from the recorded one"
-    latex = (
-        (
-            r"$p_\mathrm{f} = p\, e^{\text{gain}} + \text{offset}$ for the inflation pressure "
-            r"$p$, at least a fifth of it"
-        ),
-        (
-            r"$q_\mathrm{f} = q\, (p_\mathrm{f}/p)^{a \cdot \text{ground response}}$ for the "
-            r"ground pressure $q$, $a$ being its exponent of $p$ over the data"
-        ),
-        (
-            r"$1 - s_\mathrm{f} = (1 - s)[1 - \text{rolling radius} \cdot \ln(p_\mathrm{f}/p)]$ "
-            r"for the slip $s$"
-        ),
-    )
     parameters = ("gain", "offset", "ground_response", "rolling_radius")
     outputs = ("pull", "sinkage")
     covariates = ("pressure",)
     varies = False
 
-    def on_conditions(
-        self, phi: Array, output: str, conditions: dict[str, Array], view: View
-    ) -> dict[str, Array]:
+    def on_conditions(self, phi: Array, output: str, given: Conditions, view: View) -> Conditions:
         """Correct the inflation pressure, and the ground pressure and slip that go with it."""
         gain, offset, ground_response, rolling_radius = each(phi)
         recorded = view.of("pressure")
         true = np.maximum(recorded * np.exp(gain) + offset, 0.2 * recorded)
-        changed = dict(conditions)
-        if "pressure" in conditions:
+        changed = dict(given)
+        if "pressure" in given:
             changed["pressure"] = true
-        if "ground_pressure" in conditions:
+        if "ground_pressure" in given:
             ratio = (true / recorded) ** (view.ground_exponent * ground_response)
-            changed["ground_pressure"] = conditions["ground_pressure"] * ratio
-        if "slip" in conditions:
+            changed["ground_pressure"] = given["ground_pressure"] * ratio
+        if "slip" in given:
             larger = rolling_radius * np.log(true / recorded)
-            changed["slip"] = 1.0 - (1.0 - conditions["slip"]) * (1.0 - larger)
+            changed["slip"] = 1.0 - (1.0 - given["slip"]) * (1.0 - larger)
         return changed
 
 
@@ -232,58 +190,39 @@ class ConeIndexBias(_Fault):
     """A cone penetrometer that reads wrong by a gain and an offset."""
 
     name = "cone_index_bias"
-    check = "zero and span; above zero there is more than it reads"
-    title = "the cone penetrometer reads wrong"
-    latex = (
-        (
-            r"$\mathrm{CI}_\mathrm{f} = \mathrm{CI}\, e^{\text{gain}} + \text{offset} \cdot "
-            r"\mathrm{CI}_\mathrm{lab}$ for the cone index, $\mathrm{CI}_\mathrm{lab}$ being the "
-            r"laboratory's median"
-        ),
-    )
+    title, latex, check = words(name)
     parameters = ("gain", "offset")
     form = ("size", "cone", "water")
     outputs = ("density",)
     covariates = ("cone",)
     varies = False
 
-    def on_conditions(
-        self, phi: Array, output: str, conditions: dict[str, Array], view: View
-    ) -> dict[str, Array]:
+    def on_conditions(self, phi: Array, output: str, given: Conditions, view: View) -> Conditions:
         """Correct the cone index."""
-        if "cone" not in conditions:
-            return conditions
+        if "cone" not in given:
+            return given
         gain, offset = each(phi)
-        recorded = conditions["cone"]
+        recorded = given["cone"]
         typical = view.lab_of("cone")
         true = recorded * np.exp(gain) + offset * typical
-        return {**conditions, "cone": np.maximum(true, 0.02 * recorded)}
+        return {**given, "cone": np.maximum(true, 0.02 * recorded)}
 
 
 class WaterContentBias(_Fault):
     """A moisture probe that reads wrong by a gain and an offset."""
 
     name = "water_content_bias"
-    check = "against samples dried in an oven; above zero there is more than it reads"
-    title = "the moisture probe reads wrong"
-    latex = (
-        (
-            r"$w_\mathrm{f} = w\, e^{\text{gain}} + \text{offset}$ for the water content $w$, at "
-            r"least zero"
-        ),
-    )
+    title, latex, check = words(name)
     parameters = ("gain", "offset")
     form = ("size", "cone", "water")
     outputs = ("density",)
 
-    def on_conditions(
-        self, phi: Array, output: str, conditions: dict[str, Array], view: View
-    ) -> dict[str, Array]:
+    def on_conditions(self, phi: Array, output: str, given: Conditions, view: View) -> Conditions:
         """Correct the water content."""
         gain, offset = each(phi)
-        changed = dict(conditions)
+        changed = dict(given)
         for name in ("water", "water_by_volume"):
-            if name in conditions:
-                true = conditions[name] * np.exp(gain) + offset
+            if name in given:
+                true = given[name] * np.exp(gain) + offset
                 changed[name] = np.maximum(true, 0.0)
         return changed

@@ -12,17 +12,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.gap.effects.base import Effect, Known, View, each, saturating
+from calib.gap.effects.base import Conditions, Effect, Known, View, each, saturating, words
 from calib.models.base import Array
-
-_STRENGTH = (
-    r"$P_\mathrm{f}(s) = e^{\text{pull} \cdot h}\, P(s\, e^{\text{slope} \cdot h}) + "
-    r"\text{resistance} \cdot h\, W$ for the pull $P$ at the slip $s$, $W$ being the normal load",
-    (
-        r"$\ln z_\mathrm{f} = \ln z + (\text{rut} + \text{rut slip} \cdot s)\, h$ for the rut "
-        r"depth $z$"
-    ),
-)
 
 
 class _SoilStrength(Effect):
@@ -36,15 +27,13 @@ class _SoilStrength(Effect):
         """Covariate h, zero at the laboratory's value, shape (n,)."""
         raise NotImplementedError
 
-    def on_conditions(
-        self, phi: Array, output: str, conditions: dict[str, Array], view: View
-    ) -> dict[str, Array]:
+    def on_conditions(self, phi: Array, output: str, given: Conditions, view: View) -> Conditions:
         """Stretch the slip axis of the traction curve."""
-        if output != "pull" or "slip" not in conditions:
-            return conditions
+        if output != "pull" or "slip" not in given:
+            return given
         _, slope, *_ = each(phi)
         stretch = np.exp(np.clip(slope * self.covariate(view), -2.0, 2.0))
-        return {**conditions, "slip": conditions["slip"] * stretch}
+        return {**given, "slip": given["slip"] * stretch}
 
     def on_output(self, phi: Array, output: str, mean_response: Array, view: View) -> Array:
         """Scale the pull and shift the resistance; shift the logarithm of the rut."""
@@ -67,11 +56,7 @@ class MultipassCompaction(_SoilStrength):
     """Earlier passes in the same rut have compacted the soil: h = ln(pass number)."""
 
     name = "multipass_compaction"
-    title = "earlier passes in the same rut have compacted the soil"
-    latex = (
-        *_STRENGTH,
-        r"$h = \ln(N/N_\mathrm{lab})$, $N$ being the pass number",
-    )
+    title, latex, check = words(name)
     covariates = ("passes",)
     known = tuple(Known(output, zero_at=("passes",)) for output in ("pull", "sinkage"))
 
@@ -84,11 +69,7 @@ class RateEffect(_SoilStrength):
     """Soil strength changes with speed: h = ln(speed/laboratory speed)."""
 
     name = "rate_effect"
-    title = "soil strength changes with speed"
-    latex = (
-        *_STRENGTH,
-        r"$h = \ln(v/v_\mathrm{lab})$, $v$ being the speed",
-    )
+    title, latex, check = words(name)
     covariates = ("speed",)
     known = tuple(Known(output, zero_at=("speed",)) for output in ("pull", "sinkage"))
 
@@ -103,11 +84,7 @@ class MoistureSoftening(_SoilStrength):
     """Soil strength changes with water content: h = (w - laboratory w)/0.02."""
 
     name = "moisture_softening"
-    title = "soil strength changes with water content"
-    latex = (
-        *_STRENGTH,
-        r"$h = (w - w_\mathrm{lab})/0.02$, $w$ being the gravimetric water content",
-    )
+    title, latex, check = words(name)
     covariates = ("water",)
     known = tuple(Known(output, zero_at=("water",)) for output in ("pull", "sinkage"))
 
@@ -120,17 +97,7 @@ class BulldozingResistance(Effect):
     """The wheel pushes soil ahead of it: resistance W b (z/30 mm)^c (1 + g s)."""
 
     name = "bulldozing_resistance"
-    title = "the wheel pushes soil ahead of it, more as it sinks and slips"
-    latex = (
-        (
-            r"$P_\mathrm{f} = P - W \cdot \text{resistance} \cdot Z^{\text{sinkage exponent}}\, "
-            r"(1 + \text{slip growth} \cdot s)$ for the pull $P$"
-        ),
-        (
-            r"$Z$ is the simulator's sinkage over 30 mm where the case models it, else $1 + s$; "
-            r"$W$ the normal load, $s$ the slip"
-        ),
-    )
+    title, latex, check = words(name)
     parameters = ("resistance", "sinkage_exponent", "slip_growth")
     form = ("slip", "pressure")
     known = (Known("pull", -1),)
@@ -150,17 +117,7 @@ class LugThrust(Effect):
     """Lugs shear soil beside and between them: thrust W t (1 - exp(-s/s0)); they also dig."""
 
     name = "lug_thrust"
-    title = "tread lugs or grousers add thrust as slip grows"
-    latex = (
-        (
-            r"$P_\mathrm{f} = P + W \cdot \text{thrust} \cdot (1 - e^{-s/\text{slip scale}})$ for "
-            r"the pull $P$"
-        ),
-        (
-            r"$\ln z_\mathrm{f} = \ln z + \text{digging} \cdot s$ for the rut depth $z$; $W$ is "
-            r"the normal load, $s$ the slip"
-        ),
-    )
+    title, latex, check = words(name)
     parameters = ("thrust", "slip_scale", "digging")
     form = ("slip", "pressure")
     known = tuple(Known(output, 1, ("slip",), ("slip",)) for output in ("pull", "sinkage"))
@@ -184,17 +141,7 @@ class SlipSinkage(Effect):
     """Slip digs the wheel in beyond the model: ln z + a s^c; compacting more soil costs pull."""
 
     name = "slip_sinkage"
-    title = "sinkage grows with slip beyond what the model has"
-    latex = (
-        (
-            r"$\ln z_\mathrm{f} = \ln z + d$, $d = \text{growth} \cdot s^{\text{slip exponent}}$ "
-            r"for the rut depth $z$"
-        ),
-        (
-            r"$P_\mathrm{f} = P - W \cdot \text{pull loss} \cdot Z (e^d - 1)$ for the pull $P$; "
-            r"$Z$ is the simulator's sinkage over 30 mm, $W$ the normal load, $s$ the slip"
-        ),
-    )
+    title, latex, check = words(name)
     parameters = ("growth", "slip_exponent", "pull_loss")
     form = ("slip", "pressure")
     known = (Known("pull", -1, ("slip",)), Known("sinkage", 1, ("slip",), ("slip",)))
@@ -218,17 +165,7 @@ class RutRebound(Effect):
     """Part of the sinkage springs back: ln z - a0 - a g(s), g growing as s^c and levelling off."""
 
     name = "rut_rebound"
-    title = "part of the sinkage springs back, more at high slip"
-    latex = (
-        (
-            r"$\ln z_\mathrm{f} = \ln z - \text{towed} - \text{growth} \cdot g(s)$ for the rut "
-            r"depth $z$"
-        ),
-        (
-            r"$g(s) = (1 + h^c)\, s^c / (s^c + h^c)$, $s$ being the slip, $c$ the slip exponent "
-            r"and $h$ half way"
-        ),
-    )
+    title, latex, check = words(name)
     parameters = ("towed", "growth", "slip_exponent", "half_way")
     form = ("slip", "pressure")
     known = (Known("sinkage", -1, grows_with=("slip",)),)
@@ -253,18 +190,7 @@ class PostPeakSoftening(Effect):
     """
 
     name = "post_peak_softening"
-    title = "shear strength falls past its peak"
-    latex = (
-        (
-            r"$P_\mathrm{f} = P - H \cdot \text{loss} \cdot (1 - e^{-(s - \text{peak "
-            r"slip})/\text{slip scale}})$ for the pull $P$ where the slip $s$ is larger than the "
-            r"peak slip"
-        ),
-        (
-            r"$H = P + \text{resistance} \cdot W$ is the gross thrust where it is above zero, $W$ "
-            r"the normal load"
-        ),
-    )
+    title, latex, check = words(name)
     parameters = ("loss", "peak_slip", "slip_scale", "resistance")
     form = ("slip", "pressure")
     known = (Known("pull", -1, ("slip",), at_most="the gross thrust"),)
@@ -290,15 +216,7 @@ class LoadTransfer(Effect):
     """Pull times hitch height over wheelbase changes the load: N = W (1 + t pull/W)."""
 
     name = "load_transfer"
-    title = "drawbar pull changes the normal load"
-    latex = (
-        r"$N = W + \text{transfer} \cdot P$, between a fifth of $W$ and five times it",
-        r"$P_\mathrm{f} = P\, (N/W)^{\text{pull exponent}}$ for the pull $P$",
-        (
-            r"$q_\mathrm{f} = q\, (N/W)^{\text{pressure exponent}}$ for the ground pressure $q$; "
-            r"$W$ is the normal load"
-        ),
-    )
+    title, latex, check = words(name)
     parameters = ("transfer", "pull_exponent", "pressure_exponent")
     form = ("slip",)
     outputs = ("pull", "sinkage")
@@ -308,16 +226,14 @@ class LoadTransfer(Effect):
         ratio = 1.0 + transfer * view.base["pull"] / view.load_kn
         return np.log(np.clip(ratio, 0.2, 5.0))
 
-    def on_conditions(
-        self, phi: Array, output: str, conditions: dict[str, Array], view: View
-    ) -> dict[str, Array]:
+    def on_conditions(self, phi: Array, output: str, given: Conditions, view: View) -> Conditions:
         """Raise the ground pressure with the load."""
-        if output != "sinkage" or "ground_pressure" not in conditions:
-            return conditions
+        if output != "sinkage" or "ground_pressure" not in given:
+            return given
         transfer, _, exponent = each(phi)
         factor = np.exp(exponent * self._ln_load(transfer, view))
-        pressure = conditions["ground_pressure"] * factor
-        return {**conditions, "ground_pressure": pressure}
+        pressure = given["ground_pressure"] * factor
+        return {**given, "ground_pressure": pressure}
 
     def on_output(self, phi: Array, output: str, mean_response: Array, view: View) -> Array:
         """Scale the pull with the load."""
