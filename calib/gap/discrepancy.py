@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from scipy.linalg import block_diag
 from scipy.special import expit
 
@@ -60,9 +60,27 @@ class _File(BaseModel):
     ways: tuple[str, ...]
     parameters: dict[str, _Row]
 
+    @model_validator(mode="after")
+    def _as_many_loadings(self) -> _File:
+        if any(len(row.ways) != len(self.ways) for row in self.parameters.values()):
+            raise ValueError("a parameter has not as many loadings as there are ways")
+        return self
+
 
 def another_soil() -> dict[str, tuple[Array, float]]:
-    """Read how quantities move together when the soil is another one."""
+    """Read how quantities move together when the soil is another one.
+
+    Returns
+    -------
+    dict
+        Quantity to its loadings on the ways in which soils differ, shape (ways,), and the sd of
+        what it does by itself; in units of the prior sds.
+
+    Raises
+    ------
+    CalibError
+        If the prior file cannot be read or is not complete.
+    """
     path = default_priors("shifts/another_soil")
     try:
         file = _File.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
@@ -72,13 +90,6 @@ def another_soil() -> dict[str, tuple[Array, float]]:
             where=str(path),
             hint="install the package again",
         ) from None
-    if any(len(row.ways) != len(file.ways) for row in file.parameters.values()):
-        raise CalibError(
-            "a parameter has not as many loadings as there are ways",
-            where=str(path),
-            expected=f"{len(file.ways)} numbers each",
-            hint="correct it",
-        )
     return {name: (np.array(row.ways), row.own) for name, row in file.parameters.items()}
 
 

@@ -33,6 +33,7 @@ from calib.gap.hypotheses import (
 )
 from calib.gap.mixture import Mixture
 from calib.gap.noise import Noise
+from calib.inference.mode import prior_widths
 from calib.inference.prior_files import default_priors
 from calib.models import MODELS as KNOWN
 from tests.gap.cases import MODELS, NOISE, campaigns_of, make_case

@@ -35,6 +35,7 @@ from calib.gap.odds import (
     with_prior,
 )
 from calib.gap.ranking import _scores, calibrate_lab, change_over_runs, follows_runs, rank
+from calib.inference.mode import prior_widths
 from tests.gap.cases import (
     CHOICE,
     LARGE,
