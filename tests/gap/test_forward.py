@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calib.inference.sampling.mode import prior_widths
 
 from calib.data.quantities import role_of
 from calib.errors import CalibError

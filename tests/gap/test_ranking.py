@@ -9,7 +9,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from calib.inference.sampling.mode import prior_widths
 from scipy.optimize import brentq
 from scipy.stats import norm
 
