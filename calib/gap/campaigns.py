@@ -273,10 +273,10 @@ class Campaigns:
         values, both = view.conditions[name], np.concatenate([own, lab.get(name, own)])
         if name in QUANTITIES and QUANTITIES[name].of_factors:
             values, both = np.log(np.maximum(values, 1e-6)), np.log(np.maximum(both, 1e-6))
-        if np.ptp(both) < 1e-9 * max(1.0, abs(both).max()):
+        if np.ptp(both) < 1e-9 * max(1.0, float(np.abs(both).max())):
             return None
         mid, half = 0.5 * (both.max() + both.min()), 0.5 * np.ptp(both)
-        return np.clip((values - mid) / half, -1.5, 1.5)
+        return np.asarray(np.clip((values - mid) / half, -1.5, 1.5))
 
     @cached_property
     def at_rows(self) -> dict[str, NoiseConditions]:

@@ -89,11 +89,11 @@ class Mixture:
             for i, (fit, probability) in enumerate(zip(self.fits, self.probability, strict=True))
         ]
         weight = np.concatenate([part.weight for part in parts])
-        draws = [
+        simulator, truth, noise, measured = (
             {n: np.concatenate([getattr(part, kind)[n] for part in parts]) for n in self.data.names}
             for kind in ("simulator", "truth", "noise", "measured")
-        ]
-        return Truth(*draws, weight / weight.sum())
+        )
+        return Truth(simulator, truth, noise, measured, weight / weight.sum())
 
     def _part(
         self,

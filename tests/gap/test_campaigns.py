@@ -13,7 +13,7 @@ import pytest
 import calib
 from calib.data import table_from_arrays
 from calib.errors import CalibError
-from calib.gap.campaigns import Campaigns, CaseSimulator, campaigns, columns_over
+from calib.gap.campaigns import Campaigns, CaseSimulator, campaigns
 from calib.gap.case import Case
 from calib.gap.fit import fit
 from calib.gap.forward import Forward
@@ -25,7 +25,6 @@ from calib.inference.prior_files import DeclaredPriors, default_priors
 from calib.models.simulators.emulator import emulator_of
 from tests.gap.cases import PULL_ONLY, campaigns_of, make_case, table_without
 from tests.gap.fits import log_joint
-from tests.gap.test_hypotheses import density_campaigns
 from tests.inference.emulation.test_emulate import as_before as as_before
 from tests.models.simulators.examples import PRIORS, lab, pull
 
@@ -193,20 +192,6 @@ def test_speeds_are_even_in_ratios():
     np.testing.assert_allclose(scaled, 0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("what", "columns"),
-    [
-        ("water", ("gravimetric_water_content", "volumetric_water_content")),
-        ("pressure", ("inflation_pressure_psi", "average_ground_pressure_kpa")),
-        ("low_pressure", ("inflation_pressure_psi",)),
-        ("slip", ("slip_ratio",)),
-        ("tyre_temperature_c", ("tyre_temperature_c",)),
-    ],
-)
-def test_what_something_may_vary_with_has_its_columns(what, columns):
-    assert columns_over(what) == columns
-
-
 PSI = "inflation_pressure_psi"
 
 
@@ -259,31 +244,6 @@ def test_beyond_the_pressures_of_both_campaigns_it_goes_on_straight(data):
     np.testing.assert_array_equal(
         only.predict_beyond(t, misfit, wide), only.predict(t, misfit, wide)
     )
-
-
-def test_a_density_is_bent_no_farther_than_two_and_a_half_ranges_out():
-    data = campaigns(density_campaigns())
-    simulated = data.simulated["bulk_density"]
-    wet, cone = (simulated.lab[n] for n in ("gravimetric_water_content", "cone_index_kpa"))
-    half, mid = 0.5 * np.ptp(wet), 0.5 * (wet.max() + wet.min())
-    logs = np.log(cone)
-    half_log, mid_log = 0.5 * np.ptp(logs), 0.5 * (logs.max() + logs.min())
-    u, v = np.array([0.5, 2.4, 3.1, -4.0]), np.array([-1.5, 0.0, 2.0, 2.6])
-    # Any size of a cone index: its logarithm is taken.
-    at = {
-        "gravimetric_water_content": mid + half * u,
-        "cone_index_kpa": np.exp(mid_log + half_log * v),
-    }
-    t, misfit = middle(simulated, 4)
-    t[:] = t[0]
-    misfit[1:] = np.eye(3)
-    found = simulated.predict(t, misfit, at)
-    bends = found[1:] - found[0]
-    u, v = np.clip(u, -2.5, 2.5), np.clip(v, -2.5, 2.5)
-    expected = {"uu": u * u - 1 / 3, "uv": u * v, "vv": v * v - 1 / 3}
-    one, other = (list(simulated.lab).index(n) for n in at)
-    order = ("uu", "uv", "vv") if one < other else ("vv", "uv", "uu")
-    np.testing.assert_allclose(bends, [expected[name] for name in order], rtol=1e-6)
 
 
 NOISE = 0.03

@@ -21,12 +21,10 @@ from calib.gap.case import (
     Size,
     case_files,
     case_from_run,
-    cells,
     declared_covariates,
     new_values,
     read_case,
     read_context,
-    with_declared,
     words_of,
 )
 from calib.gap.corrected import load_corrected, predict_columns, save_corrected
@@ -295,23 +293,6 @@ def digging(*, known) -> Hypothesis:
     return with_known_size(single, Context(sizes={"lug_thrust": known}))
 
 
-def test_what_is_known_of_a_size_replaces_that_and_nothing_else():
-    """A positive one by its logarithm, of which the sd is sd over mean, to first order."""
-    (before,) = digging(known={}).effect_priors
-    for name, mean, sd, loc, scale in (
-        ("thrust", -0.2, 0.05, -0.2, 0.05), ("thrust", 0.0, 2.0, 0.0, 2.0),
-        ("slip_scale", 0.5, 0.2, np.log(0.5), 0.4), ("slip_scale", 1e-3, 1e-4, np.log(1e-3), 0.1),
-    ):  # fmt: skip
-        (after,) = digging(known={name: Size(mean=mean, sd=sd)}).effect_priors
-        assert (after.text, after.source) == (before.text, before.source)
-        for was, now in zip(before.entries, after.entries, strict=True):
-            if was.name != name:
-                assert now == was
-                continue
-            assert (now.loc, now.scale) == pytest.approx((loc, scale), rel=1e-12)
-            assert replace(now, loc=was.loc, scale=was.scale) == was
-
-
 def known_lugs(**known: Size) -> tuple[Context, Hypothesis]:
     return Context(sizes={"lug_thrust": known}), digging(known={})
 
@@ -532,32 +513,6 @@ def test_a_known_quantity_is_declared_by_its_name_alone(name):
         declared_covariates({name: "number"}, (typed(**{name: ["1"]}),))
 
 
-DECLARED = {"operator": ("Lind", "Berg", "Dahl"), "tyre_temperature_c": ()}
-
-
-def test_declared_columns_are_added_to_the_table():
-    """Categories as their places in the list, numbers as they are; others stay ignored."""
-    table = typed(
-        tyre_temperature_c=[" 21.5", "-3", "1e1"], weather=["dry"] * 3,
-        operator=["Berg", "Lind ", "Dahl"],
-    )  # fmt: skip
-    found = with_declared(table, DECLARED)
-    assert found["operator"].tolist() == [1.0, 0.0, 2.0]
-    assert found["tyre_temperature_c"].tolist() == [21.5, -3.0, 10.0]
-    assert found.ignored == ("weather",)
-    assert with_declared(table, {}) is table
-    assert cells(found.columns, DECLARED)["operator"] == ["Berg", "Lind", "Dahl"]
-    np.testing.assert_array_equal(
-        cells(found.columns, DECLARED)["tyre_temperature_c"], [21.5, -3.0, 10.0]
-    )
-
-
-def test_a_table_too_long_to_keep_its_cells_has_no_categories():
-    table = replace(typed(operator=["Lind", "Berg"]), text=())
-    with pytest.raises(CalibError, match=r"made\.csv has 2 rows"):
-        with_declared(table, {"operator": ("Berg", "Lind")})
-
-
 def test_a_column_that_is_not_there_is_refused(tmp_path):
     folder = case_with(tmp_path / "case", "operator", operators, operators, '"category"')
     text = (folder / "case.toml").read_text()
@@ -626,24 +581,3 @@ def test_effects_of_ones_own_are_recorded_and_not_resumed_without_them(diagnosed
     (out / "case-0" / INPUTS).write_bytes(record)
     with pytest.raises(CalibError, match="made with effects of one's own"):
         check_resumable([case], out, 1)
-
-
-@pytest.mark.parametrize(
-    ("table", "kinds"),
-    [
-        ("", None),
-        ('[covariates]\ntyre_temperature_c = "number"\nshift = "category"\n',
-         {"tyre_temperature_c": "number", "shift": "category"}),
-        ('[covariates]\nshift = ["a", "b"]\n', {"shift": "category"}),
-    ],
-)  # fmt: skip
-def test_declared_columns_are_recorded_by_their_kind(tmp_path, table, kinds):
-    case = write_case(make_case(models=PULL_ONLY, n_lab=15, n_field=12), tmp_path / "case")
-    for name in ("lab.csv", "field.csv"):
-        head, *rows = (case / name).read_text().splitlines()
-        rows = [f"{row},{20 + i},{'ab'[i % 2]}" for i, row in enumerate(rows)]
-        (case / name).write_text("\n".join([f"{head},tyre_temperature_c,shift", *rows]) + "\n")
-    with (case / "case.toml").open("a") as file:
-        file.write(table)
-    assert case_hashes(case)["covariates"] == kinds
-    assert json.loads(inputs_record(read_case(case), 1)).get("covariates") == kinds

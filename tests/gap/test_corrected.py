@@ -6,7 +6,6 @@ import json
 import re
 from contextlib import nullcontext
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -491,28 +490,3 @@ def test_a_folder_will_do_and_the_answer_is_short(tmp_path):
     few = {"force_offset": EFFECTS["force_offset"]}
     found = diagnose(folder, 1, effects=few)
     assert re.fullmatch(r"Diagnosis\(offset: effect; force_offset [\d.]+, .+\)", repr(found))
-
-
-def shrunk(weight, gap, before, after, noise=0.1, simulator=0.0):
-    """Of draws that are each one gap at both of two rows, shape (draws,)."""
-    name = "drawbar_pull"
-    true = np.repeat(np.array(gap, dtype=float)[:, None], 2, axis=1)
-    plain, sd = np.full_like(true, simulator), np.full_like(true, noise)
-    draws = Truth({name: plain}, {name: true}, {name: sd}, {name: true}, np.array(weight))
-    data = SimpleNamespace(outputs=(SimpleNamespace(name=name),))
-    return shrink(data, draws, {name: np.full(2, before)}, {name: np.full(2, after)}).get(name)
-
-
-def test_errors_and_fraction_are_those_of_weighted_draws():
-    """Nine tenths of the weight on three draws; the others are the ends of the 90 %."""
-    gap = np.array([0.5, 0.6, 1.0, 1.1, 1.5])
-    found = shrunk([0.06, 0.27, 0.34, 0.27, 0.06], gap, before=0.2, after=1.05)
-    before, after = np.abs(gap - 0.2), np.abs(gap - 1.05)
-    assert found.rmse_before == pytest.approx(0.8)
-    assert found.rmse_after == pytest.approx(0.05)
-    fractions = sorted(1.0 - after / before)
-    assert found.fraction == pytest.approx(1.0 - found.rmse_after / found.rmse_before)
-    low, high = fractions[0], fractions[-1]
-    assert found.interval[1] == pytest.approx(high)
-    assert found.interval[0] < low
-    assert found.noise_floor == pytest.approx(0.1)

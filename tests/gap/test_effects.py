@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from calib.data.quantities import role_of
-from calib.gap.campaigns import campaigns
 from calib.gap.effects import EFFECTS, Effect, Known, View
 from calib.gap.effects.dependence import DependsOn, DiffersBy, ReadingDrift, ReadingStep
 from calib.gap.forward import Forward
-from calib.gap.hypotheses import Hypothesis, dependences, effect_priors
+from calib.gap.hypotheses import Hypothesis, effect_priors
 from calib.inference.prior_files import DeclaredPriors, default_priors, read_priors
 from calib.inference.priors import Priors
 from calib.models.base import Array
@@ -386,20 +385,6 @@ def test_values_of_a_category_have_each_its_factor(usual):
                 assert found[output][k, i] == pytest.approx(wanted, rel=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("levels", "slugs"),
-    [
-        (("a", "b-c", "b c"), ("b_c_1", "b_c_2")),
-        (("a", "!", "?"), ("1", "2")),
-        (("a", "(b)", "c"), ("b", "c")),
-        (("a", "a!", "b"), ("a", "b")),
-    ],
-)
-def test_values_are_told_apart_in_the_names_of_parameters(levels, slugs):
-    effect = DiffersBy("operator", levels, {"sinkage": True}, 0)
-    assert effect.parameters == tuple(f"sinkage_factor_{slug}" for slug in slugs)
-
-
 OUTPUTS = ("pull", "sinkage", "density")
 # Parameters that make an effect vanish when they are zero; those of its shape keep some value.
 SIZES = {
@@ -756,23 +741,6 @@ def test_softening_takes_no_more_than_the_gross_thrust(data):
     assert (full >= np.minimum(plain, rest) - 1e-12).all()
 
 
-def test_strength_that_is_lost_past_the_peak_is_the_gross_thrusts(data):
-    """A wheel that just moves itself pulls less than nothing then, by what resists its motion."""
-    effect = EFFECTS["post_peak_softening"]
-    forward, _, psi = drawn_known(data, effect, "pull", family=False)
-    part = forward.phi_slices[0]
-    pulls = np.array([-2.0, -0.5, 0.0, 0.7])
-    view = along(data, "slip", np.full(4, 0.5))
-    phi = forward.hypothesis.effect_priors[0].to_natural(psi[:, part])
-    loss, peak, scale, resistance = phi.T[..., None]
-    beyond = -np.expm1(-np.maximum(0.5 - peak, 0.0) / scale)
-    thrust = np.maximum(pulls + resistance * view.load_kn, 0.0)
-    found = effect.on_output(phi, "pull", np.tile(pulls, (DRAWS, 1)), view)
-    np.testing.assert_allclose(found, pulls - thrust * loss * beyond, rtol=1e-12)
-    assert (found[:, 2] < 0.0).mean() > 0.9
-    assert (found[:, 0] == -2.0).mean() > 0.9
-
-
 GROWING = [(e, k) for e, k in FACTS if k.grows_with]
 
 
@@ -786,17 +754,3 @@ def test_what_grows_grows_by_the_formula_and_in_nine_of_ten_of_its_family(data, 
         size = np.abs(added(forward, name, psi, along(data, "slip", SLIPS)))
         fall = (np.maximum.accumulate(size, axis=1) - size).max(axis=1)
         assert (fall > part * size.max(axis=1)).mean() <= most
-
-
-def test_a_dependence_is_nothing_at_the_laboratorys_condition():
-    data = campaigns(make_case("rate_effect"))
-    effects = [e for e in dependences(data).values() if shown(data, e)]
-    assert effects
-    for effect in effects:
-        assert [k.output for k in effect.known] == list(effect.outputs)
-        for known in effect.known:
-            (role,) = known.zero_at
-            forward, name, psi = drawn_known(data, effect, known.output, family=True)
-            lab = np.array([data.view.lab_of(role)])
-            at = added(forward, name, psi, along(data, role, lab))
-            np.testing.assert_allclose(at, 0.0, atol=1e-12)

@@ -26,10 +26,8 @@ from calib.gap.noise import (
     Noise,
     NoiseConditions,
     ln_averaged,
-    ln_averaging,
     ln_prior,
     most_probable,
-    noise_conditions,
 )
 from calib.gap.ranking import rank
 from calib.he2019.gaps import paper_gaps
@@ -132,13 +130,6 @@ def test_size_and_noise_are_recovered(fitted):
     assert np.log(fitted.noise["drawbar_pull"].sigma / 0.03) == pytest.approx(0.0, abs=0.3)
 
 
-def test_residuals_are_standardised(data, fitted):
-    residual = fitted.field_residuals["drawbar_pull"]
-    assert residual.shape == (27,)
-    # 27 standard normals: sd of their rms 0.14.
-    assert np.sqrt(np.mean(np.square(residual))) == pytest.approx(1.0, abs=0.4)
-
-
 def noisy_again(case: Case, sds: Sequence[np.ndarray], seed: int) -> Campaigns:
     """The case's two tables without noise, and noise of these sds."""
     rng = np.random.default_rng(seed)
@@ -201,7 +192,7 @@ def noises(data: Campaigns) -> tuple[list[Noise], float]:
     return grid, float(np.log(ln_sigma[1] - ln_sigma[0]) + 0.5 * np.log(17.0 / np.pi))
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_the_evidence_is_that_of_the_closed_form(seed: int):
     """Laplace's at the fit's noise, that of the draws averaged over it."""
     data = straight_line(seed)
@@ -217,7 +208,7 @@ def test_the_evidence_is_that_of_the_closed_form(seed: int):
     assert found.log_evidence == pytest.approx(averaged, abs=0.2)
 
 
-@pytest.mark.parametrize("start", [0.1, 0.1005, 0.5, 0.899, 0.9])
+@pytest.mark.parametrize("start", [0.1, 0.5, 0.9])
 def test_what_nothing_depends_on_changes_no_evidence(start: float):
     def evidence(data: Campaigns, begun: list[float]) -> tuple[float, float]:
         forward = Forward(data, Hypothesis("none"), {"drawbar_pull": 0.04})
@@ -427,8 +418,8 @@ def long_chain(found, seed: int) -> np.ndarray:
     )
     sampler.random_state = np.random.RandomState(seed).get_state()
     # Autocorrelation times are up to 47 steps: thousands of effective draws.
-    sampler.run_mcmc(start, 1000)
-    return np.asarray(sampler.get_chain(discard=400, thin=20, flat=True))
+    sampler.run_mcmc(start, 600)
+    return np.asarray(sampler.get_chain(discard=300, thin=20, flat=True))
 
 
 @pytest.mark.parametrize(
@@ -459,7 +450,7 @@ def test_draws_of_a_bent_posterior_are_there_whatever_the_seed():
     few = {"slip_sinkage": EFFECTS["slip_sinkage"]}
     found = rank(campaigns(case), 1, effects=few).best("slip_sinkage")
     exact = long_chain(found, 2).std(axis=0)
-    for seed in range(1, 21):
+    for seed in range(1, 6):
         sample = refine(found, seed).sample
         assert sample is not None
         # Sds of 500 draws have a standard error of 3 %, 5 % with heavy tails.
@@ -479,22 +470,6 @@ def at_noise(n: int, *, pressures: bool = True) -> NoiseConditions:
     return NoiseConditions(
         rng.uniform(0.0, 0.6, n), np.log(30.0 / pressure) if pressures else np.zeros(n)
     )
-
-
-def test_it_grows_as_stated():
-    rows = NoiseConditions(np.array([0.0, 0.5, -0.1]), np.log(30.0 / np.array([30.0, 15.0, 60.0])))
-    found = Noise(0.1, 2.0, 1.0).sd(rows)
-    np.testing.assert_allclose(found, [0.1, 0.1 * 2.0 * 2.0, 0.1 * 0.5])
-
-
-def test_the_reference_is_the_calibrations_median_pressure():
-    data = campaigns(make_case(models=PULL_ONLY))
-    psi = data.view.conditions["inflation_pressure_psi"]
-    median = np.median(data.case.lab["inflation_pressure_psi"])
-    np.testing.assert_allclose(noise_conditions(data.view).softness, np.log(median / psi))
-    lab = data.lab_at["drawbar_pull"]
-    assert np.median(lab.softness) == pytest.approx(0.0, abs=1e-12)
-    np.testing.assert_array_equal(lab.slip, data.case.lab["slip_ratio"])
 
 
 @pytest.mark.parametrize("rho", RHO.tolist())
@@ -535,28 +510,6 @@ def test_it_is_averaged_over_as_by_quadrature():
                 density = norm.pdf(np.sqrt(squared[i]), scale=sd).prod(axis=1)
                 expected[i] += share * np.trapezoid(density, ln_sigma)
     np.testing.assert_allclose(ln_averaged(squared, rows), np.log(expected), rtol=1e-6)
-
-
-def test_averaging_leaves_the_density_at_the_most_probable_size_as_it_is():
-    """So that a hypothesis of which only that is known can be compared.
-
-    Where parameters took up a half of the variance sigma is known worse by the root of two.
-    """
-    rows = at_noise(60, pressures=False)
-    squared = np.random.default_rng(6).standard_normal(60) ** 2
-    (best,) = most_probable(squared[None], rows)
-    sd = best.sd(rows)
-    at_best = norm.logpdf(np.sqrt(squared), scale=sd).sum() + ln_prior(best)
-    raw, whole = np.sqrt(squared)[None], np.ones((1, 60))
-    (lifted,) = ln_averaging(raw, whole, rows)
-    assert 0.0 < lifted < np.log(RHO.size)
-    # Stirling's formula is off by 1/(6 n).
-    found = ln_averaged(squared[None], rows)[0]
-    assert found - lifted == pytest.approx(at_best, abs=0.005)
-    (more,) = ln_averaging(raw, 0.5 * whole, rows)
-    assert more == pytest.approx(lifted + 0.5 * np.log(2.0))
-    raw[0, 3] = np.nan
-    assert ln_averaging(raw, whole, rows).tolist() == [0.0]
 
 
 def test_how_a_noise_grows_has_a_probability_beforehand_and_all_have_one():

@@ -12,7 +12,7 @@ from calib.data.quantities import role_of
 from calib.errors import CalibError
 from calib.gap import discrepancy as module
 from calib.gap.campaigns import Campaigns, campaigns
-from calib.gap.constants import RADIUS_ERROR, SHIFT_DIFFERENCE
+from calib.gap.constants import RADIUS_ERROR
 from calib.gap.corrected import Corrected, load_corrected, predict_columns, save_corrected
 from calib.gap.describe import shifts as shift_sizes
 from calib.gap.discrepancy import ZERO_OF_SLIP, Discrepancy, another_soil, quantities
@@ -128,21 +128,6 @@ def test_a_pair_does_what_both_do(data):
     np.testing.assert_allclose(gap(both, sizes), expected, atol=1e-12)
 
 
-def test_form_error_scales_the_effect_and_nothing_else(data):
-    forward = Forward(data, single(data, "lug_thrust"), SIGMA)
-    (part,) = forward.form_slices["drawbar_pull"]
-    assert part.stop > part.start
-    psi = centre(forward)
-    psi[:, part] = 0.5
-    full, plain = forward.field(psi, data.view), forward.simulator(psi, data.view)
-    # At zero thrust and digging, the form error has nothing to scale.
-    for s in forward.phi_slices:
-        psi[:, s.start] = psi[:, s.stop - 1] = 0.0
-    zero = forward.field(psi, data.view)
-    np.testing.assert_allclose(zero["drawbar_pull"], plain["drawbar_pull"], rtol=1e-12)
-    assert full["drawbar_pull"].shape == (2, 27)
-
-
 def test_other_conditions_use_the_same_references(data):
     forward = Forward(data, single(data, "rate_effect"), SIGMA)
     psi = centre(forward)
@@ -171,31 +156,6 @@ def test_a_formula_is_trusted_less_along_some_directions(data, effect, sds):
         found = [p.scale for p in forward.priors.free[part]]
         # Where an effect does nothing there is nothing to depart from.
         assert found == pytest.approx(sds if o.role in EFFECTS[effect].outputs else [])
-
-
-def test_beyond_the_pressures_of_both_campaigns_the_pull_goes_on_straight(data):
-    forward = Forward(data, single(data, "pressure_gauge_bias"), NOISE)
-    psi = np.array([[p.loc for p in forward.priors.free]])
-    gain, offset, _, radius = range(forward.phi_slices[0].start, forward.phi_slices[0].stop)
-    psi[:, [gain, offset, radius]] = 0.0
-    recorded = data.view.conditions["inflation_pressure_psi"]
-    high = recorded == recorded.max()
-
-    def pull(shift: float, rows: np.ndarray) -> np.ndarray:
-        moved = psi.copy()
-        moved[:, offset] = shift
-        return forward.field(moved, data.view)["drawbar_pull"][0, rows]
-
-    # Within the range it is the simulator, the parabola and all, ...
-    np.testing.assert_allclose(
-        pull(0.0, high), forward.simulator(psi, data.view)["drawbar_pull"][0, high]
-    )
-    # ... and outside a line of the slope from one end of the range to the other.
-    low = recorded.min() - recorded.max()
-    slope = (pull(0.0, high) - pull(low, high)) / -low
-    for beyond in (3.0, 9.0):
-        np.testing.assert_allclose(pull(beyond, high), pull(0.0, high) + slope * beyond)
-        np.testing.assert_allclose(pull(low - beyond, high), pull(low, high) - slope * beyond)
 
 
 @pytest.mark.parametrize("beyond", [False, True])
@@ -484,20 +444,6 @@ def test_terms_are_those_of_its_equations(smooth, over, beyond):
     np.testing.assert_allclose(basis, [b for b, _ in terms], atol=1e-12)
 
 
-def test_below_a_pressure_it_is_a_step_and_a_part_of_the_pull(smooth):
-    found = of(smooth, onset_over="low_pressure")
-    psi = smooth.view.conditions["inflation_pressure_psi"]
-    step, part = found.onset(smooth.view, "drawbar_pull", np.array([0.0]))
-    # On a scale on which 18 psi is 1 and 42 psi is -1; half way at its threshold.
-    np.testing.assert_allclose(step[0, psi < 20.0], 1.0, atol=1e-6)
-    np.testing.assert_allclose(step[0, psi > 40.0], 0.0, atol=1e-6)
-    level = written_level(found, smooth.view)
-    np.testing.assert_allclose(part, step * level)
-    u = found.onset_covariate(smooth.view, "drawbar_pull")
-    there = found.onset(smooth.view, "drawbar_pull", u[:1])
-    assert there[0][0, 0] == pytest.approx(0.5)
-
-
 NOISE_SD = {o: NOISE[o] for o in MODELS}
 SIZE = 0.25
 
@@ -513,20 +459,6 @@ def drawn_shifts(data, shift_as) -> dict[str, np.ndarray]:
         for o in data.outputs
         for i, (name, width) in enumerate(zip(o.priors.names, prior_widths(o.priors), strict=True))
     } | {ZERO_OF_SLIP: psi @ shift.radius_error / RADIUS_ERROR}
-
-
-def test_alone_all_pressures_change_alike_and_shapes_less(data):
-    drawn = drawn_shifts(data, "alone")
-    sds = {name: float(values.std()) for name, values in drawn.items()}
-    assert sds["D_lo"] == pytest.approx(SIZE * np.hypot(1.0, SHIFT_DIFFERENCE), rel=0.03)
-    assert sds["z_ref"] == pytest.approx(SIZE, rel=0.03)
-    assert sds[ZERO_OF_SLIP] == pytest.approx(SIZE, rel=0.03)
-    for name in ("K_bend", "D_bend", "G_bend", "n1"):
-        assert sds[name] == pytest.approx(SIZE * SHIFT_DIFFERENCE, rel=0.03)
-    between = float(np.corrcoef(drawn["D_lo"], drawn["D_hi"])[0, 1])
-    d2 = SHIFT_DIFFERENCE**2
-    assert between == pytest.approx((1.0 - d2) / (1.0 + d2), abs=0.01)
-    assert np.corrcoef(drawn["D_lo"], drawn["z_ref"])[0, 1] == pytest.approx(0.0, abs=0.02)
 
 
 def test_with_another_soil_they_covary_as_the_prior_file_says(data):
@@ -614,19 +546,6 @@ def test_a_shifted_soil_is_saved_and_loaded(data, tmp_path):
     loaded = load_corrected(tmp_path)
     assert loaded.mixture.fits[0].forward.hypothesis.shift_as == "soil"
     before, after = (predict_columns(c, data.case.field) for c in (corrected, loaded))
-    for name in (n for n in before if "_before" in n or "_after" in n):
-        np.testing.assert_allclose(after[name], before[name], rtol=1e-9)
-
-
-def test_another_table_since_does_not_change_a_saved_model(data, tmp_path, monkeypatch):
-    fit = fitted(data)
-    mode = {o.name: np.array([p.loc for p in o.priors.free]) for o in data.outputs}
-    corrected = Corrected(Mixture(data, (fit,), (1.0,), 3), mode)
-    save_corrected(corrected, tmp_path)
-    before = predict_columns(corrected, data.case.field)
-    table = {name: (3.0 * ways, own) for name, (ways, own) in another_soil().items()}
-    monkeypatch.setattr(module, "another_soil", lambda: table)
-    after = predict_columns(load_corrected(tmp_path), data.case.field)
     for name in (n for n in before if "_before" in n or "_after" in n):
         np.testing.assert_allclose(after[name], before[name], rtol=1e-9)
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import replace
 from itertools import combinations
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,8 +18,7 @@ from calib.gap.campaigns import campaigns
 from calib.gap.case import Case, Context
 from calib.gap.constants import MIN_EFFECT_SIZE, PRIOR
 from calib.gap.effects import EFFECTS
-from calib.gap.forward import Forward
-from calib.gap.hypotheses import singles, unknowns
+from calib.gap.hypotheses import singles
 from calib.gap.identifiability import identifiability, next_measurements, smallest_shown
 from calib.gap.mixture import inclusion_probability
 from calib.gap.noise import Noise, noise_conditions
@@ -31,9 +28,8 @@ from calib.gap.odds import (
     probabilities,
     sizes,
     sizes_of_all,
-    with_prior,
 )
-from calib.gap.ranking import _scores, calibrate_lab, change_over_runs, follows_runs, rank
+from calib.gap.ranking import calibrate_lab, change_over_runs, rank
 from calib.inference.mode import prior_widths
 from tests.gap.cases import (
     CHOICE,
@@ -324,23 +320,6 @@ def changed(table):
     return table_from_arrays(columns)
 
 
-def test_a_score_is_evidence_times_relevance_times_share(monkeypatch):
-    fit = ranking_of("force_offset").fits["force_offset"][0]
-    hypothesis = replace(fit.forward.hypothesis, share=0.3)
-    forward = copy(fit.forward)
-    forward.hypothesis = hypothesis
-    shared = replace(fit, forward=forward)
-    monkeypatch.setattr(
-        "calib.gap.ranking.ln_size_restriction", lambda asked, _: [-2.0 for _ in asked]
-    )
-    assert _scores([(shared, 100), (fit, 100)], 1) == pytest.approx(
-        [fit.log_evidence - 2.0 + np.log(0.3), fit.log_evidence - 2.0]
-    )
-    monkeypatch.undo()
-    # Whose relevance is not asked after, it is not restricted to.
-    assert _scores([(shared, 0)], 1) == pytest.approx([fit.log_evidence + np.log(0.3)])
-
-
 CAUSES = ("rate_effect", "rut_rebound", "sensor_drift")
 
 
@@ -418,21 +397,6 @@ def test_a_suspicion_multiplies_the_odds_wherever_the_cause_is_a_part(name, usua
         assert suspecting.ln_prior(other) == plain.ln_prior(other)
 
 
-def test_probabilities_are_evidence_times_prior_over_their_sum():
-    odds = Odds(2, {"a": 1.5})
-    evidence = {"none": -1203.0, "unknown": -1200.0, "a": -1204.0, "b+unknown": -1199.0}
-    weight = {n: np.exp(v + 1200.0) * prior(odds, n) for n, v in evidence.items()}
-    expected = {n: w / sum(weight.values()) for n, w in weight.items()}
-    assert probabilities(evidence, odds) == pytest.approx(expected)
-
-
-def test_a_variant_has_its_share_of_its_names_prior():
-    hypothesis = SimpleNamespace(name="cause_0", share=0.2)
-    found = SimpleNamespace(forward=SimpleNamespace(hypothesis=hypothesis), log_evidence=-7.0)
-    odds = Odds(5, {})
-    assert with_prior(found, odds) == pytest.approx(-7.0 + np.log(0.2 * prior(odds, "cause_0")))
-
-
 def fit_of(case: str | None, name: str):
     return ranking_of(case).fits[name][0]
 
@@ -454,22 +418,6 @@ def test_size_is_in_noise_sds_of_the_output_where_it_is_largest():
     at = noise_conditions(fit.forward.data.view)
     in_noise = 0.1 / fit.noise["drawbar_pull"].sd(at)
     assert size[1, 0] == pytest.approx(np.sqrt(np.mean(np.square(in_noise))))
-
-
-def test_a_discrepancy_of_both_outputs_is_as_large_as_where_it_is_smallest():
-    h = next(
-        h
-        for h in unknowns(campaigns_of(None))
-        if h.onset_over == "slip" and len(h.smooth_outputs) == 2
-    )
-    noise = {"drawbar_pull": Noise(0.03, 0.0), "rut_depth": Noise(0.05, 0.0)}
-    forward = Forward(campaigns_of(None), h, {o: n.sigma for o, n in noise.items()})
-    psi = np.array([[p.loc for p in forward.priors.free]] * 2)
-    psi[:, forward.threshold] = -3.0  # everywhere beyond it: a constant
-    psi[:, forward.smooth_slices["drawbar_pull"].start] = 0.3
-    psi[1, forward.smooth_slices["rut_depth"].start] = 0.1
-    # Ten noise sds of the pull, of the rut none and two.
-    np.testing.assert_allclose(sizes(forward, noise, psi)[:, 0], [0.0, 2.0], rtol=1e-6)
 
 
 @pytest.mark.parametrize("case", ["force_offset", None])
@@ -541,22 +489,6 @@ def test_it_is_the_best_of_a_line_and_of_every_step(seed):
     steps = [order > run for run in np.sort(order)[:-1]]
     expected = max(least_squares(z, shape) for shape in (order, *steps))
     assert change_over_runs(z, order) == pytest.approx(expected, rel=1e-9)
-
-
-def test_of_noise_alone_one_in_ten_campaigns_is_looked_at():
-    """What is looked at without reason costs time, no more; what is not could not be probable."""
-    rng = np.random.default_rng(8)
-    gained = [change_over_runs(z, np.arange(30.0)) for z in rng.standard_normal((2000, 30))]
-    assert np.mean(np.array(gained) > 4.0) < 0.15
-
-
-def test_an_output_follows_the_runs_by_what_noise_alone_leaves_of_it():
-    data, ranking = campaigns_of("sensor_drift"), ranking_of("sensor_drift")
-    (none,) = ranking.fits["none"]
-    assert follows_runs(data, none) == {"pull"}
-    columns = {k: v for k, v in data.view.conditions.items() if k != "run_order"}
-    unordered = replace(data, view=replace(data.view, conditions=columns))
-    assert follows_runs(unordered, none) == set()
 
 
 def test_shares_sizes_and_cosines_are_in_their_ranges():
@@ -680,37 +612,12 @@ def tied(case: str | None, *names: str):
     return replace(ranking, probability=p)
 
 
-def test_conditions_are_those_of_the_campaigns():
-    data = campaigns_of("sensor_drift")
-    (found,) = next_measurements(
-        data, tied("sensor_drift", "sensor_drift", "force_offset").in_play, 1
-    )
-    assert set(found.separates) == {"sensor_drift", "force_offset"}
-    lab = data.case.lab.columns
-    for name, value in found.conditions.items():
-        both = np.concatenate([data.view.conditions[name], lab[name]])
-        assert both.min() <= value <= both.max()
-    assert "drawbar_pull_kn" not in found.conditions
-    assert found.gain_nats > 0.0
-
-
 def test_thrust_that_grows_with_slip_is_told_from_an_offset_at_an_end_of_the_slips():
     # The two were fitted to the same rows and cross in the middle of them.
     data = campaigns_of("lug_thrust")
     (found,) = next_measurements(data, tied("lug_thrust", "lug_thrust", "force_offset").in_play, 1)
     slip = found.conditions["slip_ratio"]
     assert slip < 0.15 or slip > 0.5
-
-
-def test_three_in_play_give_three_pairs():
-    data = campaigns_of("sensor_drift")
-    found = next_measurements(
-        data, tied("sensor_drift", "sensor_drift", "force_offset", "none").in_play, 1
-    )
-    assert len({m.separates for m in found}) == 3
-    # The offset and no gap at all differ least where the offset is: it is what it is everywhere,
-    # so that gain is the same at most conditions; all gains are positive.
-    assert all(m.gain_nats > 0.0 for m in found)
 
 
 def test_at_most_three_in_play_are_told_apart_and_none_that_is_improbable():

@@ -436,32 +436,6 @@ def test_conditions_of_overlapping_ranges_are_odd_from_ten_times_on(factor, odd,
     assert ("in another unit" in found) == odd
 
 
-PSI = "inflation_pressure_psi"
-
-
-def test_a_condition_that_the_calibration_held_constant_is_named():
-    """Of those that the simulators have, and where the field varied it."""
-    case = make_case(None)
-    told = f"{PSI}: held constant in the calibration and varied in the field"
-    flat = {PSI: np.full(len(case.lab), 30.0)}
-    assert told in said(with_columns(case, lab=flat))
-    both = with_columns(case, lab=flat, field={PSI: np.full(len(case.field), 30.0)})
-    assert "held constant" not in said(both)
-    # Speed is constant in the calibration of every such case; no simulator has it.
-    assert "held constant" not in said(case)
-    for which in ("lab", "field"):
-        tables = {"lab": case.lab, "field": case.field}
-        tables[which] = table_without(tables[which], PSI)
-        assert "held constant" not in "\n".join(oddities(**tables, models=case.models))
-
-
-def test_where_the_passes_of_the_calibration_are_not_recorded_it_is_said_what_is_assumed():
-    case = make_case(None)
-    told = said(replace(case, lab=table_without(case.lab, "pass_number")))
-    assert "the calibration has no pass_number: fresh soil, pass 1, is assumed" in told
-    assert "what depends on it" not in told
-
-
 PULL_doubts = OUTPUTS["drawbar_pull"]
 
 
