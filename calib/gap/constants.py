@@ -24,22 +24,22 @@ FAR_FACTOR = 8.0  # 1; and at least this factor beyond them; test_screening
 FAR_PART = 0.05  # of the rows; more far values are the campaigns' own way; test_screening
 
 # Pairs of campaigns that look odd.
-ODD_RATIO = 4.0  # 1; outputs of two campaigns differ by less; test_plausibility
-FAR_RATIO = 10.0  # 1; conditions with overlapping ranges differ by less; test_plausibility
-PERCENT_RATIO = 50.0  # 1; a fraction and a percentage differ by 100, within 2; test_plausibility
-NEAR_UNIT, ROUGHLY_UNIT = 0.15, 0.4  # sds of a log ratio from a factor of units; test_plausibility
-HELD = 0.05  # relative scatter of a condition that was held constant; test_plausibility
-NOISIER = 2.0  # 1; scatter of the field over the lab's that is said; test_plausibility
+ODD_RATIO = 4.0  # 1; outputs of two campaigns differ by less; test_screening
+FAR_RATIO = 10.0  # 1; conditions with overlapping ranges differ by less; test_screening
+PERCENT_RATIO = 50.0  # 1; a fraction and a percentage differ by 100, within 2; test_screening
+NEAR_UNIT, ROUGHLY_UNIT = 0.15, 0.4  # sds of a log ratio from a factor of units; test_screening
+HELD = 0.05  # relative scatter of a condition that was held constant; test_screening
+NOISIER = 2.0  # 1; scatter of the field over the lab's that is said; test_screening
 UNUSUAL_SIZE = 4.0  # sds from its prior at which a known size is questioned; test_case
 FOLLOWS_RUNS = 4.0  # nats gained by a line or step over the runs; test_ranking
 
-# How noise grows: with slip by 1 + rho s, with softness by (p_lab / p)^kappa; test_noise.
+# How noise grows: with slip by 1 + rho s, with softness by (p_lab / p)^kappa; test_fit.
 RHO = np.array([0.0, 1.0, 2.5, 5.0])  # 1
 LN_RHO_PRIOR = np.log(np.array([0.5, 0.2, 0.15, 0.15]))  # most noise is even
 KAPPA = np.array([0.0, 0.8, -0.8])  # 1; He et al.'s pull is twice as noisy at 18 as at 42 psi
 LN_KAPPA_PRIOR = np.log(np.array([0.7, 0.2, 0.1]))
 
-# Prior probabilities of hypotheses; test_hypotheses, test_odds.
+# Prior probabilities of hypotheses; test_hypotheses, test_ranking.
 PRIOR = {"none": 0.40, "unknown": 0.12, "parameter_shift": 0.12, "single": 0.36}  # of the kinds
 PAIR_TO_SINGLE = 0.04  # each cause more: effects act independently, each in 1 of 25 campaigns
 RESIDUAL_DISCREPANCY = 0.15  # something unlisted acts beside listed causes
@@ -70,27 +70,27 @@ FORM_ERROR = {
 }
 MISFIT = 1.0  # noise sds; inadequacy of a simulator at the end of the lab's range; test_forward
 
-# Minimum effect sizes, and tempering of the likelihood; test_odds.
+# Minimum effect sizes, and tempering of the likelihood; test_ranking.
 MIN_EFFECT_SIZE = 1.5  # noise sds rms in some output: what counts as an effect
 MIN_EFFECT_SIZE_IN_PAIR = 1.0  # noise sds; each of several causes
 LEFT = 0.08  # of a gap that no formula has the shape of; large gaps are calibrated by it
 MOST_LEFT = 0.6  # noise sds; the most of that
 
 # What a diagnosis says.
-NAMED = 0.5  # probability from which a hypothesis or cause is named; test_diagnose
-WORTH_SAYING = 0.05  # probability from which a caveat is given; test_diagnose
-FOLDS = 5  # parts of the field rows left out in turn; test_diagnose
-FOLD_DRAWS = 300  # effective draws there: they weigh predictions, not evidence; test_diagnose
-SHARE_ERROR = 0.35  # relative error of a cause's size among several; test_inclusion
+NAMED = 0.5  # probability from which a hypothesis or cause is named; test_files
+WORTH_SAYING = 0.05  # probability from which a caveat is given; test_files
+FOLDS = 5  # parts of the field rows left out in turn; test_files
+FOLD_DRAWS = 300  # effective draws there: they weigh predictions, not evidence; test_files
+SHARE_ERROR = 0.35  # relative error of a cause's size among several; test_mixture
 SMALLEST_GAP = 0.5  # of the noise (rms); a smaller gap cannot shrink; test_corrected
 SURPRISE = 1.25  # 1; widens the lower end of a shrink to hold 90 % of blind cases; test_corrected
-ALIKE = 0.95  # cosine from which a design cannot tell two effects apart; test_identifiability
-PLENTY = 1280  # effective draws; evidence within 0.04 nats (one sd); test_importance
+ALIKE = 0.95  # cosine from which a design cannot tell two effects apart; test_ranking
+PLENTY = 1280  # effective draws; evidence within 0.04 nats (one sd); test_fit
 
 
 @dataclass(frozen=True)
 class SearchLimits:
-    """How far the search for explanations goes; nats of evidence times prior; test_search."""
+    """How far the search for explanations goes; nats of evidence times prior; test_ranking."""
 
     pair_seeds: int = 4  # best single effects, of which one is in every pair
     sets_changed: int = 2  # best sets of each number of causes that others are made from
