@@ -16,28 +16,10 @@ from numpy.typing import NDArray
 from scipy.special import softmax
 
 from calib.data.quantities import OUTPUTS, role_of
+from calib.gap import document as doc
 from calib.gap.campaigns import OutputData, columns_over
 from calib.gap.constants import WORTH_SAYING
 from calib.gap.diagnose import Diagnosis, Placebo, assumed, field_parts, placebos
-from calib.gap.document import (
-    Cause,
-    DataFile,
-    Definition,
-    Design,
-    Expected,
-    Explanation,
-    Form,
-    GapDocument,
-    Next,
-    Output,
-    Parameter,
-    RunTrend,
-    Size,
-    Unlisted,
-    Untested,
-    UnusedRow,
-    track_record,
-)
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.fit import Fit
 from calib.gap.hypotheses import parameter_units
@@ -53,21 +35,13 @@ from calib.models.base import Array
 _N_DRAWS = 400
 # The normal's 95 % point: of upper limits, and of shifts that stand out.
 _Z = 1.645
-# Less probable explanations are ruled out.
-_POSSIBLE = 0.01
 # Changes below this part of the noise are not worth a sentence.
 _SMALL = 0.3
-# The part of the rows at an end of a condition that stands for the end.
-_END = 0.2
-# An sd above this part of the prior's says that the data did not narrow the parameter.
-_NOT_NARROWED = 0.9
-# Most readings that it makes sense to ask for.
-_MOST_REPEATS = 50
 
 
 def gap_document(
     found: Diagnosis, command: Sequence[str] = (), versions: Mapping[str, str] | None = None
-) -> GapDocument:
+) -> doc.GapDocument:
     """Compute all that the files, the page and the figures of a diagnosis show.
 
     Parameters
@@ -78,7 +52,7 @@ def gap_document(
 
     Returns
     -------
-    GapDocument
+    doc.GapDocument
     """
     data, ranking, case = found.data, found.ranking, found.data.case
     placebo, design, best = placebos(found), ranking.identifiability, ranking.order[0]
@@ -94,7 +68,7 @@ def gap_document(
         for name, group in ranking.fits.items()
         if name in case.context.sizes
     ]
-    return GapDocument(
+    return doc.GapDocument(
         name=case.name,
         label=case.label,
         headers=(*case.field.header, *case.lab.header),
@@ -102,7 +76,7 @@ def gap_document(
         versions=dict(versions or {}),
         seed=found.seed,
         files=tuple(
-            DataFile(role, PurePath(t.source).name, len(t), t.sha256)  # type: ignore[arg-type]
+            doc.DataFile(role, PurePath(t.source).name, len(t), t.sha256)  # type: ignore[arg-type]
             for role, t in tables
             if t is not None
         ),
@@ -110,7 +84,7 @@ def gap_document(
         outputs=_outputs(found),
         explanations=tuple(_explanation(found, n, prior[n], placebo) for n in ranking.order),
         definitions=tuple(_definitions(found)),
-        track_record=track_record(ranking.probability[best]),
+        track_record=doc.track_record(ranking.probability[best]),
         causes=tuple(_cause(found, n, c) for n, c in found.inclusion.causes.items()),
         remainder=_cause(found, UNLISTED, found.inclusion.residual_discrepancy),
         remainder_where=found.inclusion.where,
@@ -140,7 +114,7 @@ def gap_document(
         uncoarsened=probabilities(ranking.log_evidence, ranking.odds)[best],
         before=placebo.before,
         next_measurements=tuple(_next(found, m) for m in found.next_measurements),
-        design=Design(
+        design=doc.Design(
             dict(design.absorbed),
             dict(design.detectable),
             tuple((a, b, value) for (a, b), value in design.cosine_similarity.items()),
@@ -178,14 +152,14 @@ def _effects(found: Diagnosis) -> dict[str, Effect]:
 # Outputs and rows
 
 
-def _outputs(found: Diagnosis) -> tuple[Output, ...]:
+def _outputs(found: Diagnosis) -> tuple[doc.Output, ...]:
     data, truth, best = found.data, found.truth, found.ranking.best(found.ranking.order[0])
     before = found.corrected.calibrated(data.view.conditions)
     gathered = []
     for o, gap in zip(data.outputs, found.gaps, strict=True):
         bound = o.problem.bound
         gathered.append(
-            Output(
+            doc.Output(
                 name=o.name,
                 title=bound.model.title,
                 n_lab=len(o.problem.table),
@@ -210,7 +184,7 @@ def _outputs(found: Diagnosis) -> tuple[Output, ...]:
     return tuple(gathered)
 
 
-def _unused(found: Diagnosis) -> Iterator[UnusedRow]:
+def _unused(found: Diagnosis) -> Iterator[doc.UnusedRow]:
     """Predict the gap at rows that were not judged by."""
     if not any(found.unused.values()):
         return
@@ -218,7 +192,7 @@ def _unused(found: Diagnosis) -> Iterator[UnusedRow]:
     for g in row_gaps(found.data, found.truth, rows):
         for row, gap, sd, p in zip(g.rows, g.gap, g.sd, g.probability, strict=True):
             reason = found.unused[g.output][int(row)]
-            yield UnusedRow(g.output, int(row), float(gap), float(sd), float(p), reason)
+            yield doc.UnusedRow(g.output, int(row), float(gap), float(sd), float(p), reason)
 
 
 def _prediction(found: Diagnosis) -> dict[str, tuple[str, ...] | tuple[float, ...]]:
@@ -267,11 +241,11 @@ def _covered(found: Diagnosis) -> dict[str, tuple[float, float]]:
 # Explanations and their parameters
 
 
-def _explanation(found: Diagnosis, name: str, prior: float, placebo: Placebo) -> Explanation:
+def _explanation(found: Diagnosis, name: str, prior: float, placebo: Placebo) -> doc.Explanation:
     ranking = found.ranking
     fit = ranking.best(name)
     shift = fit.forward.hypothesis.shift_as if fit.forward.hypothesis.shift > 0.0 else ""
-    return Explanation(
+    return doc.Explanation(
         name,
         ranking.probability[name],
         prior,
@@ -283,7 +257,7 @@ def _explanation(found: Diagnosis, name: str, prior: float, placebo: Placebo) ->
     )
 
 
-def _parameters(fit: Fit, i: int) -> Iterator[Parameter]:
+def _parameters(fit: Fit, i: int) -> Iterator[doc.Parameter]:
     """Estimate the parameters of the i-th effect of a fit, fixed ones too."""
     priors, part = fit.forward.hypothesis.effect_priors[i], fit.forward.phi_slices[i]
     effect = fit.forward.hypothesis.effects[i].name
@@ -291,14 +265,14 @@ def _parameters(fit: Fit, i: int) -> Iterator[Parameter]:
     own = dict(zip(priors.names, zip(fit.psi[part], sds, strict=True), strict=True))
     for prior, value in zip(priors.entries, priors.to_natural(fit.psi[None, part])[0], strict=True):
         if prior.fixed:
-            yield Parameter(
+            yield doc.Parameter(
                 effect, prior.name, prior.unit, float(value), 0.0, "value", (float(value), 0.0)
             )
         else:
             yield parameter(effect, prior, *map(float, own[prior.name]))
 
 
-def parameter(effect: str, prior: Prior, value: float, sd: float) -> Parameter:
+def parameter(effect: str, prior: Prior, value: float, sd: float) -> doc.Parameter:
     """Summarise a parameter from its estimate in unconstrained coordinates.
 
     One that cannot be distinguished from its bound at zero is an upper limit (95 %).
@@ -316,10 +290,11 @@ def parameter(effect: str, prior: Prior, value: float, sd: float) -> Parameter:
         spread = (prior.upper - prior.lower) / math.sqrt(12.0)
     # A logarithm's sd is relative.
     mean = math.exp(value) if prior.log else value
-    found = Parameter(
+    found = doc.Parameter(
         effect, prior.name, prior.unit, mean, sd * mean if prior.log else sd, "value", ()
     )
-    of_prior = math.isfinite(spread) and sd > _NOT_NARROWED * spread
+    # The data did not narrow it.
+    of_prior = math.isfinite(spread) and sd > 0.9 * spread
     if of_prior and not math.isfinite(prior.scale):
         value, sd = 0.5 * (prior.lower + prior.upper), spread
         mean = math.exp(value) if prior.log else value
@@ -333,7 +308,7 @@ def parameter(effect: str, prior: Prior, value: float, sd: float) -> Parameter:
     return replace(found, shown=shown, of_prior=of_prior)
 
 
-def shifts(outputs: Sequence[OutputData], fit: Fit) -> Iterator[Parameter]:
+def shifts(outputs: Sequence[OutputData], fit: Fit) -> Iterator[doc.Parameter]:
     """Find the shifts of the simulators' parameters that stand out from their own sd.
 
     Those of logarithms are relative, in percent; so is the rolling radius, by its empty name.
@@ -356,18 +331,18 @@ def shifts(outputs: Sequence[OutputData], fit: Fit) -> Iterator[Parameter]:
             value, sd, unit = 100.0 * math.expm1(value), 100.0 * math.exp(value) * sd, "percent"
         elif prior is None:
             value, sd = 100.0 * value, 100.0 * sd
-        yield Parameter(output, name, unit, value, sd, "value", (value, sd))
+        yield doc.Parameter(output, name, unit, value, sd, "value", (value, sd))
 
 
-def _definitions(found: Diagnosis) -> list[Definition]:
-    rows: dict[tuple[str, str], Definition] = {}
+def _definitions(found: Diagnosis) -> list[doc.Definition]:
+    rows: dict[tuple[str, str], doc.Definition] = {}
     for name in found.ranking.order:
-        if found.ranking.probability[name] < _POSSIBLE:
+        if found.ranking.probability[name] < 0.01:  # ruled out
             continue
         hypothesis = found.ranking.best(name).forward.hypothesis
         for effect, priors in zip(hypothesis.effects, hypothesis.effect_priors, strict=True):
             for p in priors.free:
-                row = Definition(effect.name, p.name, p.unit, p.reason, p.text, p.source)
+                row = doc.Definition(effect.name, p.name, p.unit, p.reason, p.text, p.source)
                 rows.setdefault((effect.name, p.name), row)
     return [*rows.values()]
 
@@ -375,10 +350,10 @@ def _definitions(found: Diagnosis) -> list[Definition]:
 # Causes
 
 
-def _cause(found: Diagnosis, name: str, c: Included) -> Cause:
+def _cause(found: Diagnosis, name: str, c: Included) -> doc.Cause:
     effects = _effects(found)
     own = effects.get(name)
-    cause = Cause(name, c.probability, c.share, c.share_interval)
+    cause = doc.Cause(name, c.probability, c.share, c.share_interval)
     if own is None or not own.instrument:
         return cause
     same = sorted(n for n, e in effects.items() if own.device and e.device == own.device)
@@ -387,7 +362,7 @@ def _cause(found: Diagnosis, name: str, c: Included) -> Cause:
     )
 
 
-def _expected(found: Diagnosis, name: str) -> Expected:
+def _expected(found: Diagnosis, name: str) -> doc.Expected:
     """Find a fault's size in the most probable explanation that has it.
 
     Of a gauge it is both gain and offset, of which either may be wrong.
@@ -402,11 +377,11 @@ def _expected(found: Diagnosis, name: str) -> Expected:
                 free = {p.name for p in fit.forward.hypothesis.effect_priors[i].free}
                 every = [p for p in _parameters(fit, i) if p.name in free]
                 own = [p for p in every if p.name in ("gain", "offset")] or every[:1]
-                return Expected(tuple(p for p in own if not p.of_prior))
-    return Expected()
+                return doc.Expected(tuple(p for p in own if not p.of_prior))
+    return doc.Expected()
 
 
-def _drift_ends(found: Diagnosis, fit: Fit, i: int) -> Expected | None:
+def _drift_ends(found: Diagnosis, fit: Fit, i: int) -> doc.Expected | None:
     """Compute what the i-th effect of a fit adds to a reading at the first and last run.
 
     None of what does not go by the order of the runs, or is a factor.
@@ -421,14 +396,14 @@ def _drift_ends(found: Diagnosis, fit: Fit, i: int) -> Expected | None:
     order = view.of("order")
     added = effect.on_output(phi, role, np.zeros((len(phi), order.size)), view)
     first, last = (_mean_sd(added[:, j]) for j in (order.argmin(), order.argmax()))
-    return Expected((), o.name, first, last)
+    return doc.Expected((), o.name, first, last)
 
 
 def _mean_sd(draws: Array) -> tuple[float, float]:
     return float(draws.mean()), float(draws.std())
 
 
-def _untested(found: Diagnosis) -> Iterator[Untested]:
+def _untested(found: Diagnosis) -> Iterator[doc.Untested]:
     """Find listed effects on the outputs of what acts that a missing column hides, also in part."""
     acting = {n for n, c in found.inclusion.causes.items() if c.probability >= 0.5}
     known, view = _effects(found), found.data.view
@@ -441,19 +416,19 @@ def _untested(found: Diagnosis) -> Iterator[Untested]:
         effect = EFFECTS.get(name)
         excluded = name in found.data.case.context.excluded
         if effect and not excluded and matters(effect) and effect.lacking(view, found.data.roles):
-            yield Untested(name, reason)
+            yield doc.Untested(name, reason)
     for name, effect in known.items():
         columns = [view.column(role) for role in effect.covariates if role != "order"]
         lacking = tuple(c for c in columns if c and c not in view.lab)
         if lacking and name not in acting and matters(effect):
             fit = next(f for f in _fits(found) if effect in f.forward.hypothesis.effects)
-            yield Untested(name, lacking=lacking, assumed=assumed(fit))
+            yield doc.Untested(name, lacking=lacking, assumed=assumed(fit))
 
 
 # Changes over the order of the runs
 
 
-def over_runs(found: Diagnosis) -> RunTrend | None:
+def over_runs(found: Diagnosis) -> doc.RunTrend | None:
     """Compute how probably a reading changes over the runs, and in which form.
 
     Of the outputs that may, those that most probably do; None where none is at all likely to.
@@ -465,10 +440,10 @@ def over_runs(found: Diagnosis) -> RunTrend | None:
     return best if best.probability >= WORTH_SAYING else None
 
 
-def _over_runs(found: Diagnosis, outputs: tuple[str, ...]) -> RunTrend:
+def _over_runs(found: Diagnosis, outputs: tuple[str, ...]) -> doc.RunTrend:
     roles = [o.role for o in found.data.outputs if o.name in outputs]
     # Of several outputs at once no listed effect changes the readings over the runs.
-    kinds: dict[str, Form] = {
+    kinds: dict[str, doc.Form] = {
         name: "step" if "change_point" in e.parameters else "drift"
         for name, e in _effects(found).items()
         if e.instrument and "order" in e.covariates and list(e.outputs) == roles
@@ -478,13 +453,13 @@ def _over_runs(found: Diagnosis, outputs: tuple[str, ...]) -> RunTrend:
     for name, probability in found.ranking.probability.items():
         own = [c for c in name.split("+") if c in kinds]
         causes |= {c: causes[c] + probability for c in own}
-        acting: set[Form] = {kinds[c] for c in own}
+        acting: set[doc.Form] = {kinds[c] for c in own}
         if len(acting) > 1:
             acting = {"both"}
         for form in acting:
             forms[form] = forms.get(form, 0.0) + probability
     forms["neither"] = _unlisted_over_runs(found, outputs)
-    return RunTrend(
+    return doc.RunTrend(
         outputs,
         sum(forms.values()),
         tuple(sorted(forms.items(), key=lambda form: -form[1])),
@@ -510,7 +485,7 @@ def _unlisted_over_runs(found: Diagnosis, outputs: tuple[str, ...]) -> float:
 # Sizes
 
 
-def sizes(found: Diagnosis, name: str) -> Iterator[Size]:
+def sizes(found: Diagnosis, name: str) -> Iterator[doc.Size]:
     """Compute what a fitted hypothesis amounts to on the field's conditions."""
     if name == "none":
         return
@@ -550,16 +525,18 @@ def _change(found: Diagnosis, fit: Fit, psi: Array, o: OutputData) -> tuple[Arra
     return (after - before)[good], noise
 
 
-def _rms(o: OutputData, draws: Array, noise: Array, *, together: bool = False) -> Iterator[Size]:
+def _rms(
+    o: OutputData, draws: Array, noise: Array, *, together: bool = False
+) -> Iterator[doc.Size]:
     mean, sd = _mean_sd(np.sqrt(np.square(draws).mean(axis=1)))
     if mean >= _SMALL * noise.mean():
-        yield Size("rms", o.name, mean, sd, together=together)
+        yield doc.Size("rms", o.name, mean, sd, together=together)
 
 
-def _misread(found: Diagnosis, effect: Effect, phi: Array) -> list[Size]:
+def _misread(found: Diagnosis, effect: Effect, phi: Array) -> list[doc.Size]:
     """Compare conditions that truly held with the recorded ones."""
     view = found.data.view
-    sizes: dict[str, Size] = {}
+    sizes: dict[str, doc.Size] = {}
     for o in found.data.outputs:
         columns = {role_of(c): c for c in o.problem.bound.model.conditions}
         recorded = {role: view.conditions[c] for role, c in columns.items()}
@@ -571,14 +548,14 @@ def _misread(found: Diagnosis, effect: Effect, phi: Array) -> list[Size]:
             # Of a condition that only may follow, nothing is said unless the data say so.
             meant = not effect.covariates or role in effect.covariates
             if meant or abs(mean) >= 2.0 * sd:
-                sizes[role] = Size("condition", columns[role], mean, sd)
+                sizes[role] = doc.Size("condition", columns[role], mean, sd)
     # Ground pressure only follows from inflation pressure.
     if "pressure" in sizes:
         sizes.pop("ground_pressure", None)
     return [*sizes.values()]
 
 
-def _step(found: Diagnosis, fit: Fit, psi: Array) -> Size:
+def _step(found: Diagnosis, fit: Fit, psi: Array) -> doc.Size:
     """Compute by how much the reading jumps, and after which run or between which."""
     (effect,), (priors,) = fit.forward.hypothesis.effects, fit.forward.hypothesis.effect_priors
     natural = priors.to_natural(psi[:, fit.forward.phi_slices[0]])
@@ -594,12 +571,12 @@ def _step(found: Diagnosis, fit: Fit, psi: Array) -> Size:
     if half > 1.0:  # not from one run to the next
         ends = max(math.floor(run - half), int(first)), min(math.ceil(run + half), int(last))
     mean, sd = _mean_sd(np.expm1(jump) if relative else jump)
-    return Size("step", o.name, mean, sd, reads=True, relative=relative, ends=ends)
+    return doc.Size("step", o.name, mean, sd, reads=True, relative=relative, ends=ends)
 
 
 def _end(
     found: Diagnosis, effect: Effect, o: OutputData, draws: Array, noise: Array
-) -> Iterator[Size]:
+) -> Iterator[doc.Size]:
     """Compute what an effect does at the end of its condition where it does most."""
     view = found.data.view
     column = next((c for c in map(view.column, effect.covariates) if c), None)
@@ -614,7 +591,7 @@ def _end(
     if abs(mean) < _SMALL * float(noise[inside].mean()):
         return
     reads = effect.instrument and type(effect).on_output is not Effect.on_output
-    size = Size("end", o.name, mean, sd, reads=reads)
+    size = doc.Size("end", o.name, mean, sd, reads=reads)
     if column is None or place == "all":
         yield size
     elif role_of(column) == "order":
@@ -631,12 +608,13 @@ def _most(
     """Find the end of a condition where an effect does most, in noise sds, and its rows."""
     if values is None or np.ptp(values) == 0.0:
         return "all", np.ones(noise.size, dtype=np.bool_)
-    start, end = values <= np.quantile(values, _END), values >= np.quantile(values, 1.0 - _END)
+    # A fifth of the rows stands for an end.
+    start, end = values <= np.quantile(values, 0.2), values >= np.quantile(values, 1.0 - 0.2)
     done = [abs(float(draws[:, m].mean())) / float(noise[m].mean()) for m in (start, end)]
     return ("end", end) if done[1] >= done[0] else ("start", start)
 
 
-def unlisted(found: Diagnosis) -> Unlisted:
+def unlisted(found: Diagnosis) -> doc.Unlisted:
     """Find what a gap that nothing listed explains goes along with."""
     fit = found.ranking.best(UNLISTED)
     h, data = fit.forward.hypothesis, found.data
@@ -648,7 +626,7 @@ def unlisted(found: Diagnosis) -> Unlisted:
         conditions = get_model(data.case.models[ruts[0]]).conditions
         alone = [role_of(c) in ("pressure", "ground_pressure") for c in conditions] == [True]
     column, threshold = ("", None) if h.onset_over is None else _threshold(found, fit)
-    return Unlisted(over, h.smooth_outputs, column, threshold, alone, beside, _to_repeat(found))
+    return doc.Unlisted(over, h.smooth_outputs, column, threshold, alone, beside, _to_repeat(found))
 
 
 def _to_repeat(found: Diagnosis) -> Region | None:
@@ -700,10 +678,10 @@ def repeats_needed(gain_nats: float) -> int | None:
     if not gain_nats > 0.0:
         return None
     repeats = math.ceil(math.log(20.0) / gain_nats)
-    return repeats if repeats <= _MOST_REPEATS else None
+    return repeats if repeats <= 50 else None  # nobody makes more
 
 
-def _next(found: Diagnosis, m: NextMeasurement) -> Next:
+def _next(found: Diagnosis, m: NextMeasurement) -> doc.Next:
     field, lab = found.data.view.conditions, found.data.case.lab.columns
     roles = _roles_that_matter(found, m.separates)
     measured = {role_of(column) for column in m.conditions}
@@ -716,7 +694,7 @@ def _next(found: Diagnosis, m: NextMeasurement) -> Next:
         follows = role == "ground_pressure" and "pressure" in measured
         if np.ptp(both) > 0.0 and not follows and role != "order" and role in roles:
             columns.append(column)
-    return Next(
+    return doc.Next(
         m.separates,
         dict(m.conditions),
         m.gain_nats,

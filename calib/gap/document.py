@@ -87,16 +87,12 @@ class Output:
         Whether noise is a part of the value (the model predicts its logarithm).
     noise : Noise
         Of a reading, under the most probable explanation.
-    latex, numbers, parametrisation, references, parameters
-        Of the simulator: equation, its number in the source, how and about what it is parametrised.
     rows : tuple of int
-        Rows of the field file, from 0; the other sequences are of these rows.
-    measured, before, after : tuple of float
-        Reading, calibrated simulator, corrected simulator.
-    noise_sd, gap, gap_sd : tuple of float
-        Sd of a reading; truth minus simulator and its sd.
-    probability : tuple of float
-        That the gap exceeds the noise.
+        Rows of the field file, from 0; the sequences below are of these rows.
+    measured, before, after, noise_sd : tuple of float
+        Reading, calibrated simulator, corrected simulator; sd of a reading.
+    gap, gap_sd, probability : tuple of float
+        Truth minus simulator, its sd, and the probability that it exceeds the noise.
     residual : tuple of float
         Standardised, after the most probable explanation.
     """
@@ -386,59 +382,37 @@ class GapDocument:
 
     Parameters
     ----------
-    name, label : str
-        Of the case, and what its data must be called.
     headers : tuple of str
         Column names of the field and the calibration: a page is in their units.
-    command, versions
-        What made it.
-    verdict : {"effect", "none", "unknown", "ambiguous"}
-    explanations : tuple of Explanation
-        Most probable first.
-    causes : tuple of Cause
-        Listed causes, most probable first.
-    remainder : Cause
-        Something unlisted, alone or beside listed causes.
-    remainder_where : tuple of Region
+    explanations, causes : tuple
+        Most probable first; `remainder` is something unlisted, alone or beside listed causes.
     titles : mapping of str to str
         Effect to what happens, in a few words.
     sizes : tuple of Size
         What the most probable explanation amounts to.
     conditions : mapping of str to tuple of float
-        Of the field rows, in the order in which a reader looks for a cause.
+        Of all field rows, in the order in which a reader looks for a cause.
     covered : mapping of str to (float, float)
-        What the two campaigns cover together.
+        Conditions of both campaigns together.
     covariates : mapping of str to tuple of str
         Values of declared categories; none for numbers.
-    regions : tuple of Region
     leading : tuple of int
         Places in `regions`: the first of each output, and one along what the best is about.
-    shrink : mapping of str to Shrink
-    judged_on : {"new conditions", "rows left out", "fitted rows"}
-        What the error reduction was judged on; `parts` is in how many parts rows were left out.
-    gap : float
-        Size in noise sds (rms in the output where it is largest).
-    left, coarsening, uncoarsened : float
-        What no formula has the shape of (noise sds), by what the logarithms of odds are divided
-        for it, and the first explanation's probability without that.
-    before : float
-        Residual of the calibrated simulator on the field rows, rms over the noise.
-    smallest : float
-        Smallest size that the design can name, in noise sds of the laboratory.
-    not_testable : mapping of str to str
-        Effect to reason.
+    judged_on, parts
+        What the error reduction was judged on; in how many parts rows were left out.
+    gap, left, coarsening, uncoarsened : float
+        Size of the gap and what no formula has the shape of (noise sds, rms), by what logarithms of
+        odds are divided for it, and the first explanation's probability without that.
+    before, smallest : float
+        Residual of the calibrated simulator on the field rows (rms over the noise); smallest effect
+        that the design can name (noise sds of the laboratory).
     assumed : mapping of str to float
         Conditions that the calibration does not record, as the best explanation takes them.
-    put_in : tuple of str
-        What was put into the diagnosis besides the data, in words.
-    suspected, excluded : tuple of str
-        Causes that were put in as suspected, or with their size; and that are known not to act.
-    without_context : mapping of str to float, optional
-        Probabilities of causes without that; None if nothing was put in.
+    put_in, suspected, excluded, without_context
+        What was put in besides the data, in words; causes suspected or sized; causes excluded; and
+        the probabilities of causes without all that.
     doubts : tuple of str
         What the most probable explanation should not leave in the field, each a clause.
-    notes, warnings : tuple of str
-        Where the data are from; what a reader must know.
     prediction : mapping of str to tuple
         Columns of ``fresh_prediction.csv``; empty without conditions to predict.
     """

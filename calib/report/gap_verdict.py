@@ -12,7 +12,6 @@ from calib.gap.document import Explanation, GapDocument, RunTrend
 SURE = 0.9
 # Explanations within this factor of the best are a tie with it.
 TIE = 0.2
-_MOST_TIED = 4
 
 
 class Tone(StrEnum):
@@ -44,7 +43,7 @@ def rivals(runs: RunTrend) -> list[tuple[str, float]]:
 
 def tied(d: GapDocument) -> list[Explanation]:
     """Return the explanations that are about as probable as the first."""
-    return [e for e in d.explanations if e.probability >= TIE * d.best.probability][:_MOST_TIED]
+    return [e for e in d.explanations if e.probability >= TIE * d.best.probability][:4]
 
 
 def _sure(d: GapDocument) -> bool:

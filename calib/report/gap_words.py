@@ -37,10 +37,6 @@ from calib.report.page.template import template
 
 # What is less probable is not spoken of: as a percentage it is below 5.
 _SHOWN = 0.045
-# Pulls below this (kN) are those of a single small wheel, written in newtons.
-_SMALL_PULL = 0.1
-# A region that covers all rows.
-EVERYWHERE = "all conditions measured"
 
 _NAMES = {
     "none": "none (noise)", "unknown": "unknown effect", "parameter_shift": "parameter shift",
@@ -99,7 +95,7 @@ class Notation:
         column = OUTPUTS.get(quantity, quantity)
         axis = axis_of(column)
         own = [o.measured for o in self.d.outputs if OUTPUTS[o.name] == column]
-        if own and axis.unit == "kN" and np.abs(own[0]).max() < _SMALL_PULL:
+        if own and axis.unit == "kN" and np.abs(own[0]).max() < 0.1:
             return Axis(axis.name, "N", 1000.0)
         return axis
 
@@ -205,7 +201,7 @@ class Notation:
         rows = next(o.rows for o in self.d.outputs if o.name == r.output)
         values = np.array(self.d.conditions[column])[list(rows)]
         everywhere = low <= values.min() and high >= values.max()
-        return EVERYWHERE if everywhere else self.stretch(column, low, high)
+        return "all conditions measured" if everywhere else self.stretch(column, low, high)
 
     # Choices from the document
 

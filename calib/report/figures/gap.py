@@ -45,14 +45,12 @@ from calib.report.gap_verdict import TIE
 from calib.report.gap_words import Notation, Words, chance, short_name
 from calib.report.labels import MINUS, NO_UNIT, Axis, axis_of, percent_range, short, units_of
 
-_BAND, _PALE = "#e6e6e6", "#c9c9c9"
+_BAND = "#e6e6e6"
 # White to dark: how probable it is that a gap exceeds the noise. It survives greyscale.
 _PROBABLE = LinearSegmentedColormap.from_list("probable", ["#ffffff", "#f6c9a5", "#D55E00"])
 _NORM = Normalize(0.0, 1.0)
 # Half the width of a 90 % interval, in sds.
 _Z = 1.64
-# How many are shown.
-_MOST_HYPOTHESES, _MOST_CONDITIONS, _MOST_PRESSURES = 8, 6, 4
 _SPECIAL = ("none", "unknown", "parameter_shift")
 
 
@@ -128,7 +126,7 @@ def panel_groups(
     if column is None or np.ptp(pressure) == 0.0:
         return [("", np.ones(rows.size, dtype=np.bool_))]
     distinct, axis = np.unique(pressure), axis_of(column)
-    if distinct.size <= _MOST_PRESSURES:
+    if distinct.size <= 4:
         return [(f"{axis.value_text(p)} {axis.unit}", pressure[rows] == p) for p in distinct]
     edges = np.quantile(pressure, [0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0])
     groups = []
@@ -182,7 +180,7 @@ def conditions_plate(d: GapDocument, say: Words) -> Plate | None:
         names = [n for n in names if role_of(n) != "ground_pressure"]
     # A condition with a region in it must not be left out.
     marked = {key for r in d.regions for key in r.conditions}
-    names = sorted(names, key=lambda n: n not in marked)[:_MOST_CONDITIONS]
+    names = sorted(names, key=lambda n: n not in marked)[:6]
     names.sort(key=order.index)
     if not names:
         return None
@@ -282,8 +280,9 @@ def _key(fig: Figure, *, regions: bool) -> None:
 
 def which_plate(d: GapDocument, say: Words) -> Plate:
     """Draw the probabilities of the hypotheses."""
-    shown = [e for i, e in enumerate(d.explanations) if i < _MOST_HYPOTHESES or e.name in _SPECIAL]
-    tied = [e for e in shown[:_MOST_HYPOTHESES] if e.probability >= TIE * d.best.probability]
+    first, others = d.explanations[:8], d.explanations[8:]
+    shown = [*first, *(e for e in others if e.name in _SPECIAL)]
+    tied = [e for e in first if e.probability >= TIE * d.best.probability]
     # As wide as the margin: longer names, of several causes at once, take two lines or three.
     labels = [textwrap.fill(short_name(e.name), 38) for e in shown]
     rows = np.maximum(1.0, [0.66 * (1 + label.count("\n")) for label in labels])
@@ -295,7 +294,7 @@ def which_plate(d: GapDocument, say: Words) -> Plate:
         leading = e in tied
         ax.barh(
             yi, e.probability, edgecolor=BLACK if leading else "none", lw=0.5, height=0.66,
-            color=BLUE if e is d.best else SKY if leading else _PALE,
+            color=BLUE if e is d.best else SKY if leading else "#c9c9c9",
             hatch="///" if leading and len(tied) > 1 else None,
         )  # fmt: skip
         ax.text(
@@ -311,7 +310,6 @@ def which_plate(d: GapDocument, say: Words) -> Plate:
     if len(tied) > 1:
         read = "read them as a tie" if d.best.probability < 0.5 else "any of them may be right"
         note(ax, f"hatched: not far apart,\n{read}", x=0.98, y=0.05, color=BLACK)
-    others = d.explanations[_MOST_HYPOTHESES:]
     rest = sum(e.probability for e in others if e.name not in _SPECIAL)
     caption = say("caption_which", tied, len(others), rest)
     return Plate(fig, "which", caption, "Which: the hypotheses")
@@ -420,7 +418,7 @@ def isolability_plate(d: GapDocument, say: Words) -> Plate | None:
     absorbed.set_xlabel(f"Absorbed by the\nparameters ({NO_UNIT})")
     size = np.array([design.detectable[name] for name in names])
     shown = np.minimum(size, 4.0)
-    smallest.hlines(y, 0.0, shown, color=_PALE, lw=1.0)
+    smallest.hlines(y, 0.0, shown, color="#c9c9c9", lw=1.0)
     smallest.plot(shown, y, "o", color=BLUE, ms=4.5)
     for yi, x, value in zip(y, shown, size, strict=True):
         text = short(float(value)) if value < 100.0 else "none"

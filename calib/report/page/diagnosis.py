@@ -18,8 +18,6 @@ from calib.report.labels import units_of
 from calib.report.markup import prose
 from calib.report.page.template import equation, parametrisation, picture, template
 
-# A less probable hypothesis or cause is ruled out.
-_POSSIBLE = 0.01
 # A shape beside every colour.
 TONE_MARKS = {
     Tone.FINE: "\N{HEAVY CHECK MARK}",
@@ -82,7 +80,6 @@ def render_page(d: GapDocument, plates: Sequence[Plate], images: Mapping[str, by
             verdict=verdict,
             mark=TONE_MARKS[verdict.tone],
             figures={p.name: picture(p, images.get(p.name, b""), p.caption) for p in plates},
-            possible=_POSSIBLE,
             groups=hypothesis_groups(d),
             name=short_name,
             relevance=(LEFT, MOST_LEFT, MIN_EFFECT_SIZE, MIN_EFFECT_SIZE_IN_PAIR),
@@ -105,10 +102,10 @@ def hypothesis_groups(d: GapDocument) -> dict[str, list[Explanation]]:
     best = tied(d)
     best += [e for e in d.explanations[len(best) :] if e.probability >= 0.2 * d.best.probability]
     rest = d.explanations[len(best) :]
-    out = [e for e in rest if e.probability < _POSSIBLE]
+    out = [e for e in rest if e.probability < 0.01]
     groups: dict[str, Any] = {
         "best": best,
-        "less": [e for e in rest if e.probability >= _POSSIBLE],
+        "less": [e for e in rest if e not in out],
         "out": [e for e in out if "+" not in e.name],
         "sets": [e for e in out if "+" in e.name],
     }
