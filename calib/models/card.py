@@ -121,11 +121,6 @@ def _continued(own: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
-# HTML needs none.
-_NAMESPACE = ' xmlns="http://www.w3.org/1998/Math/MathML"'
-_FUNCTION = r"\\(?:sin|cos|tan|arctan|exp|ln|log|max|min)\b"
-
-
 def mathml(latex: str) -> str:
     """Return words with mathematics between dollars as HTML with MathML."""
     parts = latex.split("$")
@@ -133,24 +128,44 @@ def mathml(latex: str) -> str:
 
 
 def formula(latex: str, display: Literal["inline", "block"] = "inline") -> str:
-    """Return mathematics as MathML, which browsers draw without script, font or request."""
+    """Return mathematics as MathML, which browsers draw without script, font or request.
+
+    They do not break its lines: inline, each part from a sign to the next is an element of its own.
+    """
+    row = _parsed(latex)
+    parts: list[list[ElementTree.Element]] = [[]]
+    for node in row:
+        if display == "inline" and parts[-1] and node.tag == "mo" and node.text in _SIGNS:
+            node.set("form", "infix")
+            parts.append([])
+        parts[-1].append(node)
+    written = ("".join(ElementTree.tostring(n, "unicode") for n in part) for part in parts)
+    return "\N{ZERO WIDTH SPACE}".join(
+        f'<math display="{display}"><mrow>{p}</mrow></math>' for p in written
+    )
+
+
+# Before which a line may be broken: =, + and a minus sign.
+_SIGNS = ("=", "+", "\N{MINUS SIGN}")
+
+
+def _parsed(latex: str) -> ElementTree.Element:
+    """Return the row of a formula's parts as MathML."""
     from latex2mathml.converter import convert  # late: a tenth of a second
 
     # Browsers do not set functions off from the letters beside them.
-    latex = re.sub(rf"(?<=[\w)\]}}])\s*(?={_FUNCTION})", r"\\,", latex)
-    spaced = re.sub(rf"({_FUNCTION})\s*(?=[A-Za-z\\])", r"\1\\,", latex)
-    return str(convert(spaced, display=display)).replace(_NAMESPACE, "")
+    function = r"\\(?:sin|cos|tan|arctan|exp|ln|log|max|min)\b"
+    latex = re.sub(rf"(?<=[\w)\]}}])\s*(?={function})", r"\\,", latex)
+    latex = re.sub(rf"({function})\s*(?=[A-Za-z\\])", r"\1\\,", latex)
+    # HTML needs no name space.
+    return ElementTree.fromstring(re.sub(' xmlns="[^"]*"', "", str(convert(latex))))[0]
 
 
 def text(latex: str) -> str:
     """Return words with mathematics between dollars as plain text."""
     parts = latex.split("$")
-    return "".join(_plain(formula(part)) if i % 2 else part for i, part in enumerate(parts))
-
-
-def _plain(mathml: str) -> str:
-    """Write MathML as plain text."""
-    return normalize("NFKC", _row(ElementTree.fromstring(mathml))).replace("\N{MINUS SIGN}", "-")
+    written = (_row(_parsed(part)) if i % 2 else part for i, part in enumerate(parts))
+    return normalize("NFKC", "".join(written)).replace("\N{MINUS SIGN}", "-")
 
 
 def _row(nodes: Iterable[ElementTree.Element]) -> str:
@@ -158,15 +173,13 @@ def _row(nodes: Iterable[ElementTree.Element]) -> str:
     row, upright = "", False
     for node in nodes:
         part = _part(node)
-        if node.tag == "mo" and part in _OPERATORS and row and row[-1] not in "([{/ ":
+        operator = node.tag == "mo" and part in "=+\u2212\u00b7\u00d7\u2264\u2265<>"
+        if operator and row and row[-1] not in "([{/ ":
             part = f" {part} "
         elif row and _ends_word(row) and _begins_word(part):
             part = part if upright and node.get("mathvariant") == "normal" else f" {part}"
         row, upright = row + part, node.get("mathvariant") == "normal"
     return row
-
-
-_OPERATORS = frozenset("=+\N{MINUS SIGN}\N{MIDDLE DOT}\N{MULTIPLICATION SIGN}\u2264\u2265<>")
 
 
 def _ends_word(row: str) -> bool:

@@ -1,60 +1,31 @@
-"""Empirical models of traction, shear stress and rut depth.
+"""Empirical models of traction, shear stress and rut depth: equations and symbols in their cards.
 
-Net traction from a mobility number and slip: Wismer & Luth (1973), Brixius (1987).
+Wismer & Luth (1973), Brixius (1987): the published coefficients are the medians of the priors. In
+Brixius' net traction the two terms 0.04, of the gross traction and of the motion resistance,
+cancel; printed forms that omit the first of them differ. The exponent of radial tyres is 9.5 or
+10.5, by source: it lies within its prior.
 
-With W the load, CI the cone index, b and d width and diameter of the tyre, delta its deflection
-and h the height of its section,
-
-    Cn = CI b d / W                                      Bn = Cn (1 + 5 delta/h)/(1 + 3 b/d)
-    P/W = c1 [1 - exp(-c2 Cn s)] - c3/Cn - c4            (Wismer & Luth)
-    P/W = c1 [1 - exp(-c2 Bn)] [1 - exp(-c3 s)] - c4/Bn - c5 s/sqrt(Bn)    (Brixius, bias ply)
-
-The published coefficients are the medians of the priors. In Brixius' net traction the two terms
-0.04, of the gross traction and of the motion resistance, cancel; printed forms that omit the first
-of them differ. The exponent of radial tyres is 9.5 or 10.5, by source: it lies within its prior.
-
-Net traction over load, an exponential of slip: the form of Upadhyaya & Wulfsohn (1993).
-
-    P/W = a [1 - b exp(-c s)]
-
-Of the 1993 paper its summary and list of symbols could be seen, not the printed equation: three
-parameters a', b', c' of the net traction and two, a and c, of the torque. The form is that of
-three, its coefficients are free, and none published is used. What is sampled are the net traction
-coefficient p20 at 20 % slip, at which traction is usually compared, and the motion resistance
-coefficient r at no slip:
+Upadhyaya & Wulfsohn (1993): their summary and list of symbols could be seen, not the printed
+equation. The form is that of three parameters, its coefficients are free, and none published is
+used. The net traction coefficient p20 at 20 % slip, at which traction is usually compared, and the
+motion resistance coefficient r at no slip are sampled:
 
     P/W = -r + (p20 + r) [1 - exp(-c s)]/[1 - exp(-0.2 c)]
 
-Net traction of a tyre whose contact with the ground is an ellipse.
-
-    P = (A c + W tan phi) G(s l/K) - rho W,   A = pi l w/4,   p = W/A
-
-The load presses evenly on an ellipse of the length l and the width w. A part of the tread that has
-come a distance x into the contact has sheared the soil by j = s x, and Janosi and Hanamoto's stress
+An elliptic contact: the load presses evenly on the ellipse. A part of the tread that has come a
+distance x into the contact has sheared the soil by j = s x, and Janosi and Hanamoto's stress
 (c + p tan phi)[1 - exp(-j/K)], averaged over the ellipse, is its strength times
 
     G(q) = 1 - (4/pi) int_0^(pi/2) exp(-q sin t) cos^2 t dt = 1 - (2/q)[I1(q) - L1(q)]
 
-with the modified Bessel and Struve functions of order one. G(q) is 4q/(3 pi) for small q and
-1 - 4/(pi q) for large. That is the form of the models with an elliptic contact of Upadhyaya &
-Wulfsohn (1993) and of Rosca, Carlescu and others (2006-2022), of whose papers summaries and
-symbols could be seen, not how they find the contact from the deflection and the sinkage: its
-length and width are measured here, and the motion resistance coefficient rho is free.
+with the modified Bessel and Struve functions of order one. That is the form of Upadhyaya & Wulfsohn
+(1993) and of Rosca, Carlescu and others (2006-2022), of whose papers summaries and symbols could be
+seen, not how they find the contact from the deflection and the sinkage: its length and width are
+measured here, and the motion resistance coefficient rho is free.
 
-Shear stress from normal stress and displacement: Janosi & Hanamoto (1961).
-
-tau = (c + sigma tan phi)[1 - exp(-j/K)], with tau, c and sigma in kPa, phi in degrees, j and K in
-mm. For soils without a peak of the shear stress.
-
-Rut depth from a mobility number: the form of Maclaurin (1990).
-
-    z = k d N^-m,   N = I (b d)^(1 - q/2) delta^q / W
-
-with z, b, d and the deflection delta in m, the cone index I in kPa and the load W in kN. N is
-Maclaurin's mobility number for q = 0.4. Both are read in one public program after Saarilahti
-(2002), with k = 0.224 and m = 1.25, and could not be confirmed from a second source: exponents and
-factor are free. N is the wheel numeric I b d/W times f^q, with f = delta/sqrt(b d); at the means of
-the data z is z_ref, which is sampled in the place of k. The noise is on ln z.
+Maclaurin (1990): N is his mobility number for q = 0.4. Both are read in one public program after
+Saarilahti (2002), with k = 0.224 and m = 1.25, and could not be confirmed from a second source:
+exponents and factor are free. N is the wheel numeric I b d/W times f^q, with f = delta/sqrt(b d).
 """
 
 from __future__ import annotations

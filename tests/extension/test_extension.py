@@ -297,12 +297,6 @@ def test_a_prior_in_another_unit_than_its_parameter_is_refused(
         assert word in refused.err
 
 
-def test_a_unit_written_otherwise_is_the_same(run: Calib) -> None:
-    text = own("wheel_torque.py").read_text(encoding="utf-8")
-    Path("own.py").write_text(text.replace('unit = "kN*m"', 'unit = "kN m"'), encoding="utf-8")
-    assert run("models", "--models", "own.py").code == 0
-
-
 def test_ones_own_are_told_as_well(run: Calib) -> None:
     mine = ["--models", own("wheel_torque.py")]
     assert "wheel_torque_nm: N*m" in run("quantities", "wheel_torque", *mine).out

@@ -43,8 +43,6 @@ from calib.models.constants import END_BYTES, KILL_SECONDS
 from calib.models.simulators.child import of_surroundings
 from calib.models.simulators.simulator import Failure, Given, Printed, no_output, not_made, tail
 
-# A variable in the environment of a program and all that it starts.
-_MARK = "CALIB_RUN"
 # The environment variable with the folder of the simulator file.
 HOME = "CALIB_SIMULATOR"
 
@@ -66,7 +64,7 @@ def run_program(
             child = subprocess.Popen(
                 list(arguments), cwd=folder, stdin=subprocess.DEVNULL, stdout=printed,
                 stderr=subprocess.STDOUT, start_new_session=True,
-                env=os.environ | {_MARK: mark} | ({HOME: home} if home else {}),
+                env=os.environ | {"CALIB_RUN": mark} | ({HOME: home} if home else {}),
             )  # fmt: skip
         except OSError as error:
             why = _script(arguments[:1]) or error.strerror
@@ -84,16 +82,12 @@ def run_program(
     if code:
         end = tail(_text(path, whole=False))
         shells = ("sh", "bash", "dash", "ksh", "zsh", "env")
-        of_shell = code in _NOT_RUN or Path(arguments[0]).stem in shells
+        of_shell = code in (126, 127) or Path(arguments[0]).stem in shells
         why = (_script(arguments) if of_shell else "") or _prevented(code, folder)
         if why:
             raise not_made(f"{_ended(code)}: {why}; it printed: {end.strip() or 'nothing'}")
         return Failure("exit", _ended(code), end)
     return _text(path, whole=whole)
-
-
-# Exit codes of a shell or `env` whose program is missing or cannot be run.
-_NOT_RUN = (126, 127)
 
 
 def _prevented(code: int, folder: Path) -> str:
@@ -104,7 +98,7 @@ def _prevented(code: int, folder: Path) -> str:
     # A shell that runs it adds 128 to the signal.
     if -code in killed or code - 128 in killed:
         return "something else has ended it; where memory is short, the system does"
-    if code in _NOT_RUN:
+    if code in (126, 127):  # of a shell or `env` whose program is missing or cannot be run
         return (
             f"a program that it starts is not there or cannot be run; it runs in {folder}, made "
             "for this run alone and removed after it, and finds its own files in the folder that "
@@ -217,7 +211,7 @@ def _marked(mark: str) -> list[psutil.Process]:
     running = psutil.process_iter(["environ"])
     return [
         one for one in running
-        if (one.info["environ"] or {}).get(_MARK) == mark
+        if (one.info["environ"] or {}).get("CALIB_RUN") == mark
     ]  # fmt: skip
 
 
@@ -320,7 +314,7 @@ class UmbridgeRunner:
         return True
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class CallableRunner:
     """A Python function, ``(theta, conditions) -> output``.
 
@@ -335,38 +329,35 @@ class CallableRunner:
     columns: tuple[str, ...]
     batched: bool = True
     limit: float | None = None
-    identity: str = field(init=False, repr=False, compare=False)
-    unshared: str = field(init=False, repr=False, compare=False)
-    _left: str = field(init=False, repr=False, compare=False)
+    unshared: str = field(default="", init=False, repr=False)
+
+    key: ClassVar[str] = "python"
+    runs: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "unshared", "")
-        try:
-            what = fingerprint(self.function)
-        except ValueError as error:
-            what = uuid4().hex
-            object.__setattr__(self, "unshared", str(error))
-        self._is(what)
+        self._is = self._left = self._looked()
 
-    def _is(self, what: str) -> None:
-        object.__setattr__(self, "identity", f"callable {self.batched} {what}")
-        object.__setattr__(self, "_left", what)
+    def _looked(self) -> str:
+        """Return what the function is now."""
+        try:
+            return fingerprint(self.function)
+        except ValueError as error:
+            self.unshared = str(error)
+            return uuid4().hex
+
+    @property
+    def identity(self) -> str:
+        """What the function is, and how it is called."""
+        return f"callable {self.batched} {self._is}"
 
     @contextmanager
     def watched(self) -> Iterator[None]:
         """Notice changes of the function between such blocks, but not within."""
-        if self.unshared:
-            yield
-            return
-        with suppress(ValueError):
-            if (now := fingerprint(self.function)) != self._left:
-                self._is(now)
+        if not self.unshared and (now := self._looked()) != self._left:
+            self._is = now
         yield
-        with suppress(ValueError):
-            object.__setattr__(self, "_left", fingerprint(self.function))
-
-    key: ClassVar[str] = "python"
-    runs: ClassVar[bool] = True
+        if not self.unshared:
+            self._left = self._looked()
 
     def run(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Given:
         """Call it for one parameter vector."""
@@ -540,10 +531,6 @@ class TableRunner:
         return Failure("error", "there are the runs of the table and no others")
 
 
-# Where a value belongs in a template.
-_PLACE = re.compile(r"@([^\W\d]\w*)@")
-
-
 def input_json(parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> str:
     """Return both as JSON: numbers by parameter, lists by condition."""
     lists = {name: values.tolist() for name, values in conditions.items()}
@@ -563,7 +550,7 @@ def input_csv(parameters: Mapping[str, float], conditions: Mapping[str, Array]) 
 
 def check_template(template: str, names: tuple[str, ...], where: str) -> None:
     """Check that a template has a place for each name, and no other; a CalibError if not."""
-    marks = set(_PLACE.findall(template))
+    marks = set(re.findall(r"@([^\W\d]\w*)@", template))
     missing = [name for name in names if name not in marks]
     unknown = sorted(marks - set(names))
     if missing or unknown:
@@ -580,7 +567,9 @@ def filled(template: str, parameters: Mapping[str, float], conditions: Mapping[s
     """Fill in a template's marks, values of a condition separated by spaces."""
     values = {name: repr(value) for name, value in parameters.items()}
     values |= {name: " ".join(map(repr, v.tolist())) for name, v in conditions.items()}
-    return _PLACE.sub(lambda mark: values[mark[1]], template)
+    for name, value in values.items():
+        template = template.replace(f"@{name}@", value)
+    return template
 
 
 def output_of_text(text: str, how: str, patterns: Mapping[str, str]) -> Given:

@@ -109,7 +109,6 @@ class _Handler(BaseHTTPRequestHandler):
             "more": {"output": [[1.0], [1.0]]},
             "number": {"output": [1.0]},
             "bool": {"output": [[True]]},
-            "text": {"output": [["1,5"]]},
             "pair": {"output": [[1.0, 2.0]]},
         }
         body = json.dumps(replies.get(mood, {"output": [[1.0]]})).encode()

@@ -178,12 +178,6 @@ def nothing(t: np.ndarray, x: dict) -> None:
     in_percent(t, x)
 
 
-def sorted_rows(t: np.ndarray, x: dict) -> object:
-    import pandas
-
-    return {"pull": pandas.Series(in_percent(t, x)["pull"][0]).sort_values(ascending=False)}
-
-
 def table(t: np.ndarray, x: dict) -> object:
     import pandas
 
@@ -196,7 +190,6 @@ def table(t: np.ndarray, x: dict) -> object:
         (in_percent, {}),
         (in_percent, {"limit": 60.0}),
         (lambda theta, x: in_percent(theta[None], x)["pull"][0], {"batched": False}),
-        (kilograms, {}),
         (kilograms, {"limit": 60.0}),
         (table, {}),
     ],
@@ -210,14 +203,10 @@ def test_a_function_gives_canonical_units(gives: Callable, options: dict) -> Non
     [
         (lambda t, x: 1 / 0, None, "error", "ZeroDivisionError", ""),
         (lambda t, x: sys.exit(0), None, "error", "SystemExit: 0", ""),
-        (lambda t, x: np.array([1.0, np.nan]), None, "nan", "1 of 2 rows, first in row 2", ""),
         (lambda t, x: np.array([1.0]), None, "short", "1 values for 2 rows", ""),
-        (lambda t, x: "1,5", None, "unreadable", "'1,5' is no number", ""),
         (lambda t, x: np.ones((2, 2)), None, "short", "4 values for 2 rows", ""),
         (masked, None, "nan", "1 of 2 rows, first in row 2", ""),
         (complex_, None, "unreadable", "imaginary parts up to 0.001", ""),
-        (nothing, None, "unreadable", "nothing (None)", ""),
-        (sorted_rows, None, "unreadable", "labelled 1, 0", ""),
         (hangs, 1.0, "time", "it took longer than 1 s", ""),
         (raises, 60.0, "error", "RuntimeError: the mesh folds", "meshing"),
         (ends, 60.0, "exit", "exit code 7", ""),
@@ -306,7 +295,7 @@ def plain(f: Callable) -> BoundModel:
 @pytest.mark.parametrize("of", [quick, plain])
 def test_a_model_that_is_asked_by_the_sampler_gives_the_same(of: Callable) -> None:
     np.testing.assert_allclose(of(kilograms).mean_response(SOME, X), pull(SOME, X))
-    for unusable in (complex_, transposed, nothing, sorted_rows):
+    for unusable in (complex_, transposed, nothing):
         with pytest.raises(CalibError):
             of(unusable).mean_response(SOME, X)
     gaps = of(masked).mean_response(SOME, X)
@@ -391,11 +380,8 @@ def printing(value: str) -> str:
         ("open(sys.argv[2], 'w').write('[1]'); sys.exit()", "unreadable", "not an object"),
         ("p['mu'] = float('nan')", "nan", "2 of 2 rows"),
         (printing("[True, False]"), "unreadable", "bool"),
-        (printing("['1,5', '2,5']"), "unreadable", "'1,5' is no number"),
-        (printing("[10**400, 1]"), "unreadable", "too large"),
         (printing("[[1.0], [2.0, 3.0]]"), "unreadable", "differ in length"),
         (printing("[1.0, None]"), "nan", "not finite in 1 of 2 rows, first in row 2"),
-        (printing("[1.0, float('inf')]"), "nan", "not finite in 1 of 2 rows, first in row 2"),
         (printing("[1.0, 2.0, 3.0]"), "short", "3 values for 2 rows"),
         (printing("{{'0': 1.0}}"), "unreadable", "no output 'pull'; it gave nothing"),
     ],
@@ -421,8 +407,6 @@ def test_a_program_that_fails(tmp_path: Path, extra: str, kind: str, word: str) 
         ("pull,pull\\n1,3\\n2,4", "csv", "'pull' is there twice"),
         ("step,pull\\n1,1,5\\n2,2,5", "csv", "different numbers of cells"),
         ("pull\\n1_5\\n2.0", "csv", "'1_5' is no number"),
-        ("pull\\n****\\n2.0", "csv", "'****' is no number"),
-        ("pull\\nTrue\\nFalse", "csv", "'True' is no number"),
         ("F=1.5e+03 F=2.5e+03 ", "pattern", "the beginning of '1.5e+03'"),
         ("F=1,5 F=2,5 ", "pattern", "the beginning of '1,5'"),
     ],
@@ -522,7 +506,6 @@ def url() -> Iterator[str]:
         ("more", "unreadable", "2 output vectors for pull"),
         ("number", "unreadable", "'output': [1.0]"),
         ("bool", "unreadable", "bool"),
-        ("text", "unreadable", "'1,5' is no number"),
         ("pair", "short", "4 values"),
     ],
 )
