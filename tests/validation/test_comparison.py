@@ -73,11 +73,14 @@ def test_weights_are_those_of_an_optimiser() -> None:
 
 
 def test_the_model_that_made_the_data_is_preferred(frictional: Comparison) -> None:
-    assert frictional.candidates[0].model == "reece"
+    """Bekker's plate has Reece's equation within it, and says the same of these plates."""
     assert frictional.sound
-    assert frictional.sentence.startswith("The data prefer reece to ")
     assert frictional.differences["bekker"].clear
-    assert frictional.weights["reece"] > 0.8
+    assert frictional.differences["reece"].elpd < 0.2
+    assert not frictional.differences["reece"].clear
+    best = frictional.candidates[0].model
+    assert frictional.sentence.startswith(f"The data prefer {best} to bekker.")
+    assert frictional.weights["bekker"] < 0.05
     held = {c.model: c.held_elpd for c in frictional.candidates}
     assert held["reece"] > held["bekker"]
 
