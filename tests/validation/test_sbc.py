@@ -216,7 +216,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sbc") / "run"
     result = CliRunner().invoke(
         app,
-        ["sbc", "--out", str(folder), "--model", "bekker", "--simulations", "5", "--seed", "3",
+        ["sbc", "--out", str(folder), "--model", "bekker", "--simulations", "10", "--seed", "3",
          "--workers", "1"],
     )  # fmt: skip
     assert result.exit_code == 0, result.output
@@ -233,10 +233,10 @@ def test_the_command_leaves_numbers_figures_and_a_page(out: Path) -> None:
     assert found["seed"] == 3
     assert found["alarms"] == []
     model = found["models"]["bekker"]
-    assert model["replicates"] == 5
+    assert model["replicates"] == 10
     assert set(model["coverage"]) == {"50", "90", "95"}
     for quantity in model["quantities"].values():
-        assert len(quantity["pit"]) == 5
+        assert len(quantity["pit"]) == 10
         assert quantity["p"] <= quantity["p_adjusted"]
 
 
@@ -283,12 +283,12 @@ def test_two_processes_give_what_one_gives(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (lambda folder: {"seed": 4, "simulations": 5}, "another seed"),
+        (lambda folder: {"seed": 4, "simulations": 10}, "another seed"),
         (lambda folder: {"models": ("no_such",)}, "there is no model"),
     ],
 )
 def test_what_does_not_fit_is_refused(out: Path, spoil, message: str) -> None:
-    arguments = {"models": ("bekker",), "simulations": 5, "seed": 3, **spoil(out)}
+    arguments = {"models": ("bekker",), "simulations": 10, "seed": 3, **spoil(out)}
     with pytest.raises(CalibError, match=message):
         run_sbc(out, **arguments)
 
@@ -322,7 +322,7 @@ def test_replicates_that_fail_are_named_and_the_others_are_scored(
 def test_a_miscalibration_is_said_first(out: Path) -> None:
     from dataclasses import replace
 
-    found = run_sbc(out, models=("bekker",), simulations=5, seed=3)
+    found = run_sbc(out, models=("bekker",), simulations=10, seed=3)
     (model,) = found.models
     spoilt = replace(model.quantities[0], p=1e-6)
     bad = replace(found, models=(replace(model, quantities=(spoilt, *model.quantities[1:])),))
