@@ -81,7 +81,7 @@ def pool(workers: int, files: Mapping[Path, Loader] | None = None) -> Iterator[E
         yield executor
         executor.shutdown()
     except BaseException as error:
-        for process in list(executor._processes.values()):
+        for process in list((executor._processes or {}).values()):
             process.kill()
         executor.shutdown(wait=False, cancel_futures=True)
         if isinstance(error, BrokenProcessPool):
