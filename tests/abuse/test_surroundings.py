@@ -617,7 +617,7 @@ def to_windows(folder: Path) -> None:
 def test_other_line_ends_are_no_difference_and_are_told() -> None:
     assert run(*FIT).exit_code == 0
     to_windows(Path("run"))
-    done = run("check", "run", "--quick")
+    done = run("check", "run", "--workers", "1")
     assert done.exit_code == 0, done.output
     assert "SAME but for line ends" in done.output
     assert "2 files have other line ends, as git's autocrlf makes them" in done.output
