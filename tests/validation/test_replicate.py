@@ -110,7 +110,7 @@ def test_simulated_outputs_replace_the_embedded_ones() -> None:
 
 # One chance in ten thousand of a false alarm in all quantities together.
 RARE = 1e-4
-SEED, CHEAP, FEWEST = 40, "bekker", 4
+SEED, CHEAP, FEWEST = 40, "bekker", 3
 
 
 def narrowed(calibration: Calibration, factor: float) -> Calibration:
@@ -193,7 +193,7 @@ def test_a_replicate_is_a_pure_function_of_its_item() -> None:
 
 def test_one_that_does_not_converge_is_counted_and_left_out(fewest) -> None:
     spoilt = [dict(r) for r in fewest]
-    spoilt[3] = {**spoilt[3], "converged": False}
+    spoilt[2] = {**spoilt[2], "converged": False}
     whole, found = score_model(fewest), score_model(spoilt)
     assert found.replicates == FEWEST
     assert found.unconverged == 1
