@@ -27,9 +27,9 @@ _OURS = ("manifest.json", "run.json", "diagnosis.json", "score.txt", "audit.json
          "comparison.json")  # fmt: skip
 _WRITTEN = (
     *_OURS, "index.html", "summary.json", "figures", "data", "priors", "gaps", "case",
-    "corrected.json", "fresh_prediction.csv", "priors.toml", "data.csv", "tables", "methods.txt",
-    "methods.tex", "references.bib", "audit.csv", "inputs.json", "runs", "emulator.npz",
-    "emulators", "compared", "held_out.csv",
+    "corrected.json", "document.json", "fresh_prediction.csv", "priors.toml", "data.csv", "tables",
+    "methods.txt", "methods.tex", "references.bib", "audit.csv", "inputs.json", "runs",
+    "emulator.npz", "emulators", "compared", "held_out.csv",
 )  # fmt: skip
 # The disk is full, the quota used up, the file system read-only.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
