@@ -45,7 +45,7 @@ class CandidateSet:
         Log of evidence times prior, by the best guess and one step of the other parameters, if the
         posterior is as broad as that of the set it was made from.
     starts : ndarray, shape (k, d)
-        StartingPoints, the best first.
+        Starting points, the best first.
     first : int
         How many of the guesses are the best of a part that the set was made from.
     """
@@ -67,7 +67,7 @@ class CandidateSet:
         return Start(self.forward, self.starts, self.noise, len(self.starts))
 
     def with_starts_of(self, other: CandidateSet) -> CandidateSet:
-        """Return the better of two promises of a set, with the guesses of both."""
+        """Return the better of two estimates for one set, with the starting points of both."""
         one, two = sorted((self, other), key=lambda p: -p.expected)
         parts = (
             one.starts[: one.first],
@@ -78,13 +78,13 @@ class CandidateSet:
         return replace(one, starts=np.concatenate(parts), first=one.first + two.first)
 
     def parted(self) -> tuple[CandidateSet, CandidateSet]:
-        """Part a promise: the best guesses of the parts it was made from, and the others."""
+        """Split the starting points: the best of the parts it was made from, and the others."""
         first, others = self.starts[: self.first], self.starts[self.first :]
         return replace(self, starts=first), replace(self, starts=others)
 
 
 class StartingPoints:
-    """Begins fits of hypotheses of one case.
+    """Starting points for fits of the hypotheses of one case.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ class StartingPoints:
         return fits
 
     def begun(self, hypothesis: Hypothesis) -> Start:
-        """Begin at the lab's calibration, effects at several guesses of their prior."""
+        """Start at the lab's calibration, with several draws of the effects' priors."""
         forward, start = self._forward(hypothesis)
         if hypothesis.onset_over is not None:
             start = self._onset_start(forward, start)
@@ -120,7 +120,7 @@ class StartingPoints:
         return Start(forward, np.concatenate([start[None], starts]), self.noise, SEARCH.started)
 
     def start_from(self, hypothesis: Hypothesis, members: Sequence[Fit], count: int) -> Start:
-        """Begin where parts of a hypothesis have led, the effects they lack by their prior."""
+        """Start from fits of parts of a hypothesis; effects that they lack by their priors."""
         if not members:
             return self.begun(hypothesis)
         forward, start = self._forward(hypothesis)
@@ -256,7 +256,7 @@ class StartingPoints:
         return starts
 
     def _left(self, forward: Forward, start: Array) -> dict[str, Array]:
-        """What a guess leaves of the field's readings, by the role of the output."""
+        """Field residuals at a starting point, by the role of the output."""
         predicted = forward.field(start[None], self.data.view)
         left = {}
         for o in self.data.outputs:
@@ -395,7 +395,7 @@ def _pairs(
     best: Mapping[str, Fit],
     least: float,
 ) -> list[CandidateSet]:
-    """Guess at pairs that hold one of the best single effects, from either if both are."""
+    """Estimate pairs with one of the best single effects, from either member if both are."""
     found: dict[str, CandidateSet] = {}
     for m in _pair_seeds(single, best):
         added = [best[other].forward.hypothesis for other in single if other != m]
@@ -415,7 +415,7 @@ def _begun_again(
     truncated: Sequence[list[Fit]],
     leading: float,
 ) -> list[list[Fit]]:
-    """Begin the pairs that are in play from more guesses."""
+    """Fit the pairs that are in play from more starting points."""
     others = {
         i: p.parted()[1]
         for i, p in enumerate(pairs)
@@ -466,7 +466,7 @@ def _stepwise(
 def _note(
     reached: dict[str, float], fits: Sequence[Fit], promise: Callable[[Sequence[Fit]], float]
 ) -> None:
-    """Note what sets promise at the best modes that were found."""
+    """Record the best score reached by each set."""
     for f in fits:
         name = f.forward.hypothesis.name
         reached[name] = max(reached.get(name, -np.inf), promise([f]))
@@ -487,7 +487,7 @@ def _leading(sets: Sequence[Fit], least: float, odds: Odds, count: int) -> list[
 def _exchanged(
     guesses: StartingPoints, sets: Sequence[Fit], alone: Sequence[Hypothesis]
 ) -> list[CandidateSet]:
-    """Guess at sets with one effect of some in the place of another, or with one less."""
+    """Estimate sets with one effect exchanged for another, or left out."""
     promises = []
     for found in sets:
         names = {e.name for e in found.forward.hypothesis.effects}
@@ -502,7 +502,7 @@ def _exchanged(
 def _enlarged(
     guesses: StartingPoints, sets: Sequence[Fit], alone: Sequence[Hypothesis]
 ) -> list[CandidateSet]:
-    """Guess at sets of one more effect than some."""
+    """Estimate sets with one more effect."""
     promises = []
     for found in sets:
         kept = found.forward.hypothesis
@@ -557,7 +557,7 @@ def _expected(usual: Mapping[str, Priors], promise: CandidateSet) -> float:
 
 
 def _as_usual(usual: Mapping[str, Priors], forward: Forward, psi: Array) -> float:
-    """Log of how much more probable parameters are if effects have usual priors where they suit."""
+    """Log gain in prior density if effects have their usual priors where these suit."""
     gained = 0.0
     for e, wide, part in zip(
         forward.hypothesis.effects,
