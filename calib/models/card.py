@@ -132,10 +132,10 @@ def formula(latex: str, display: Literal["inline", "block"] = "inline") -> str:
 
     They do not break its lines: inline, each part from a sign to the next is an element of its own.
     """
-    row = _parsed(latex)
+    row, signs = _parsed(latex), ("=", "+", "\N{MINUS SIGN}")
     parts: list[list[ElementTree.Element]] = [[]]
     for node in row:
-        if display == "inline" and parts[-1] and node.tag == "mo" and node.text in _SIGNS:
+        if display == "inline" and parts[-1] and node.tag == "mo" and node.text in signs:
             node.set("form", "infix")
             parts.append([])
         parts[-1].append(node)
@@ -143,10 +143,6 @@ def formula(latex: str, display: Literal["inline", "block"] = "inline") -> str:
     return "\N{ZERO WIDTH SPACE}".join(
         f'<math display="{display}"><mrow>{p}</mrow></math>' for p in written
     )
-
-
-# Before which a line may be broken: =, + and a minus sign.
-_SIGNS = ("=", "+", "\N{MINUS SIGN}")
 
 
 def _parsed(latex: str) -> ElementTree.Element:
