@@ -13,8 +13,8 @@ SAME_MODE = 25.0  # squared standard distance of ascents to one mode; test_modes
 # Proposal
 ROUND_SIZES = (60, 120, 250, 400, 400, 400)  # draws per dimension + 5; test_proposal
 GOOD_EFFICIENCY = 0.9  # better proposals are not worth a round; test_proposal
-MOST_COMPONENTS = 16  # of a mixture about one mode; test_proposal
-FITTED_DRAWS = 6000  # draws; a fit to more is no better; test_proposal
+MOST_COMPONENTS = 6  # of a mixture about one mode; test_proposal
+FITTED_DRAWS = 4000  # draws; a fit to more is no better; test_proposal
 WIDENING = 1.07  # on scales; light tails cost more than heavy ones; test_sampler
 BROAD_SHARE = (0.08, 0.4)  # of broad draws, if trusted and if not; test_sampler
 

@@ -206,7 +206,7 @@ def fit_mixture(
     centres = x[rng.choice(k, size=m, p=weight)] if m > 1 else weight @ x[None]
     factor = (0.7 if m > 1 else 1.0) * np.linalg.cholesky(whole)
     shares, parts = np.full(m, 1.0 / m), [StudentT(c, factor, 6.0) for c in centres]
-    for _ in range(20):
+    for _ in range(12):
         logs = np.log(shares)[:, None] + np.stack([part.log_prob(x) for part in parts])
         by_part = np.exp(logs - log_sum(logs)) * weight
         mass = by_part.sum(axis=1)
@@ -377,7 +377,7 @@ def adapt(
         ),
     )
     rounds: list[tuple[Proposal, int]] = []
-    all_draws, all_values = np.empty((0, d)), np.empty(0)
+    all_draws, all_values, log_mixed = np.empty((0, d)), np.empty(0), np.empty(0)
     for size in ROUND_SIZES:
         draws, log_q = proposal.draw(rng, size * (d + 5) * len(guesses))
         value = log_prob(draws)
@@ -385,10 +385,12 @@ def adapt(
         if found.efficiency > GOOD_EFFICIENCY or found.efficiency == 0.0:
             break
         rounds.append((proposal, len(draws)))
-        possible = np.isfinite(value)
-        all_draws = np.concatenate([all_draws, draws[possible]])
-        all_values = np.concatenate([all_values, value[possible]])
-        log_mixed = log_sum(np.stack([np.log(n) + q.log_prob(all_draws) for q, n in rounds]))
+        draws, value = draws[np.isfinite(value)], value[np.isfinite(value)]
+        earlier = np.log(len(log_q)) + proposal.log_prob(all_draws)
+        own = log_sum(np.stack([np.log(n) + q.log_prob(draws) for q, n in rounds]))
+        log_mixed = np.concatenate([np.logaddexp(log_mixed, earlier), own])
+        all_draws = np.concatenate([all_draws, draws])
+        all_values = np.concatenate([all_values, value])
         weight = _tempered(all_values - log_mixed)
         effective = float(1.0 / np.square(weight).sum())
         proposal = proposal.fitted(all_draws, weight, effective, found.efficiency, rng)
