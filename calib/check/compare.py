@@ -385,9 +385,7 @@ def view(
     words = [named_pictures(folder, name).splitlines() for folder in (job.folder, job.made)]
     if words[0] == words[1]:
         if sure and exact:
-            return claim(
-                FIGURES, name, "its own pictures are not, byte for byte, those drawn again"
-            )
+            return claim(FIGURES, name, "its pictures are not, byte for byte, those drawn again")
         return Item(TEXT, name, Status.WITHIN, note="the same but for its pictures")
     pictures = [re.findall(r"\[picture [^\]]*\]", "\n".join(lines)) for lines in words]
     if pictures[0] != pictures[1]:

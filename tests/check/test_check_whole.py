@@ -187,7 +187,7 @@ TAMPERING: dict[str, tuple[Callable[[Path], None], str, list[str]]] = {
     "the audit as CSV": (
         in_text("audit.csv", "contradicted", "confirmed"), "audit.csv", ["audit.csv"]),
     "two figures of the audit": (
-        swap_figures(*AUDIT_FIGURES, page=True), AUDIT_FIGURES[0], [*AUDIT_FIGURES]),
+        swap_figures(*AUDIT_FIGURES, page=True), AUDIT_FIGURES[0], [*AUDIT_FIGURES, "index.html"]),
     "two figures for print": (
         swap_figures(*PRINTS), PRINTS[0], [*PRINTS]),
     "a table": (
