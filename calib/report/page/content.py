@@ -30,7 +30,6 @@ from calib.report.publish.tables import (
 from calib.report.sections import Section, emulation_words
 from calib.report.study import OutputResult, Study
 from calib.report.verdict import Level
-from calib.validation.scores import MOVED, PRIOR
 
 # A shape beside every colour.
 _LOOKS: Mapping[str, tuple[str, str]] = {
@@ -47,28 +46,10 @@ def cell(text: str, ticks: bool = False) -> Markup:
     return body + Markup('<span class="tick">{}</span>').format(tick) if ticks else body
 
 
-def _with_roles(o: Output) -> Table:
-    """Return the posterior with a column on what set each parameter."""
-    table, sampled = posterior_table(o), {s.name for s in o.posterior if s.sd_ratio == s.sd_ratio}
-    names = [s.name for s in o.posterior if s.name not in sampled] + [
-        s.name for s in o.posterior if s.name in sampled
-    ]
-
-    def said(name: str) -> str:
-        role = o.facts["roles"][name]
-        if name not in sampled:
-            return "follows from the others"
-        return f"[!{role}]" if role in (PRIOR, MOVED) else role
-
-    roles = iter(map(said, names))
-    groups = [[{**row, "Set by": next(roles)} for row in group] for group in table.groups]
-    return replace(table, groups=groups)
-
-
 def tables_of(o: Output) -> dict[str, Table | None]:
     """Return the tables on the page of an output."""
     return {
-        "posterior": _with_roles(o),
+        "posterior": posterior_table(o),
         "sensitivity": sensitivity_table(o) if o.found["prior_sensitivity"]["parameters"] else None,
         "estimates": estimates_table(o),
         "by_pressure": pressure_table(o),

@@ -31,6 +31,7 @@ from calib.report.numbers import (
     skewed,
 )
 from calib.report.reference import Figure
+from calib.validation.scores import MOVED, PRIOR
 
 TICK = "\N{CHECK MARK}"
 _LEVELS = ("50", "90", "95")
@@ -110,7 +111,10 @@ def _number(value: float | None, digits: int = 3, form: str = "") -> str:
 
 
 def posterior_table(o: Output) -> Table:
-    """Return the posterior summary of an output: parameters that follow from others first."""
+    """Return the posterior summary of an output: parameters that follow from others first.
+
+    A page says what set each parameter, too.
+    """
     derived = [s for s in o.posterior if s.sd_ratio != s.sd_ratio]
     sampled = [s for s in o.posterior if s.sd_ratio == s.sd_ratio]
     below = " The parameters above the rule follow from the sampled ones below it."
@@ -122,16 +126,21 @@ def posterior_table(o: Output) -> Table:
         "highest-density interval (HDI); effective sample sizes (ESS), R-hat [@Vehtari_2021], and "
         f"the sd over that of the prior.{below if derived else ''}",
         "lrrrrrr",
-        [[_posterior_row(s) for s in group] for group in (derived, sampled)],
+        [
+            [_posterior_row(s, o.facts.get("roles", {})) for s in group]
+            for group in (derived, sampled)
+        ],
     )
 
 
-def _posterior_row(s: ParameterSummary) -> Row:
+def _posterior_row(s: ParameterSummary, roles: Mapping[str, str]) -> Row:
+    role = roles.get(s.name, "") or "follows from the others"
+    set_by = f"[!{role}]" if role in (PRIOR, MOVED) else role
     return {
         "Parameter": _named(s.name, s.unit), "Posterior": centre_text(s),
         "95 % HDI": interval_text(s), "ESS bulk": f"{s.ess_bulk:.0f}",
         "ESS tail": f"{s.ess_tail:.0f}", "R-hat": f"{s.rhat:.3f}",
-        "sd/prior sd": format_number(s.sd_ratio, 2),
+        "sd/prior sd": format_number(s.sd_ratio, 2), **({"Set by": set_by} if roles else {}),
     }  # fmt: skip
 
 
