@@ -17,6 +17,8 @@ from collections.abc import Mapping
 from decimal import Decimal
 from typing import TYPE_CHECKING, Any
 
+from calib.report.constants import DECADES, LOPSIDED
+
 if TYPE_CHECKING:
     from calib.inference.calibration import ParameterSummary
 
@@ -203,7 +205,7 @@ def skewed(s: ParameterSummary) -> bool:
     near, far = sorted((s.median - s.hdi_lower, s.hdi_upper - s.median))
     low, high = sorted((abs(s.hdi_lower), abs(s.hdi_upper)))
     one_sign = s.hdi_lower * s.hdi_upper > 0.0
-    return far > 2.0 * near or (one_sign and high > 30.0 * low)
+    return far > LOPSIDED * near or (one_sign and high > DECADES * low)
 
 
 def end_scales(s: ParameterSummary) -> tuple[float, float]:

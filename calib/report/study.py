@@ -32,6 +32,7 @@ from calib.inference.random import generator
 from calib.inference.sampler import SamplerSettings
 from calib.models import MODELS, get_model
 from calib.models.base import Array
+from calib.report.constants import MAX_ROWS
 from calib.report.labels import degrees
 from calib.report.verdict import Evidence, gather
 from calib.validation.comparison import NoisePreference, noise_preference
@@ -40,9 +41,6 @@ from calib.validation.scores import Sensitivity, prior_sensitivity
 from calib.validation.validate import Validation, leave_one_out, validate_held_out
 
 type Progress = Callable[[str, int, int], None]
-
-# A report's figures and leave-one-out hold a number for every draw and row.
-MAX_ROWS = 5000
 
 
 @dataclass(frozen=True)

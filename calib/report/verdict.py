@@ -27,6 +27,7 @@ from calib.inference.io import RUN
 from calib.inference.problem import Problem
 from calib.inference.random import generator
 from calib.models.base import Array
+from calib.report.constants import EXPECTED, WEAK_SKILL
 from calib.report.labels import axis_of, joined, units_of
 from calib.report.page.template import words
 from calib.report.rows import Fitted, held_table, signs_along, x_column
@@ -238,7 +239,7 @@ _RULES: tuple[tuple[str, Level, str, Callable[[Evidence], bool]], ...] = (
     # Were none of them covered, it would not be found.
     ("few", Level.CARE, "Too few unseen rows",
      lambda e: binomial_p(0, e.n) > LEVEL / (len(e.checks) + 2)),
-    ("weak", Level.CARE, "Explains little", lambda e: e.skill < 0.5),
+    ("weak", Level.CARE, "Explains little", lambda e: e.skill < WEAK_SKILL),
     ("fine", Level.FINE, "Holds on unseen rows", lambda e: True),
 )  # fmt: skip
 
@@ -265,7 +266,7 @@ def judge_evidence(e: Evidence) -> Verdict:
         *e.remarks,
         *failed(tests),
     ]
-    if e.prior_hits < 0.5 * e.prior_n:
+    if e.prior_hits < EXPECTED * e.prior_n:
         remarks.append(Remark(_said("surprise", e), "Data and priors disagree", True))
     remarks.sort(key=lambda remark: not remark.title)
     rule, level, headline, _ = next(r for r in _RULES if r[3](e))

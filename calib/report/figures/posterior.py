@@ -18,6 +18,7 @@ from calib.inference.estimators import PointEstimate, method_name
 from calib.inference.priors import Prior, Priors
 from calib.models.base import Array
 from calib.models.magic_formula import coefficients_at
+from calib.report.constants import WIDE
 from calib.report.figures.plate import Plate
 from calib.report.figures.style import (
     BLACK,
@@ -33,7 +34,6 @@ from calib.report.figures.style import (
     SINGLE_MM,
     SMALLEST_PT,
     SYMBOL_PT,
-    WIDE,
     caption,
     legend_below,
     panels,

@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
+from calib.report.constants import DPI
 from calib.report.page.template import words
 
 if TYPE_CHECKING:
@@ -38,9 +39,6 @@ SINGLE_MM, MIDDLE_MM, DOUBLE_MM = 90.0, 140.0, 190.0
 # No text is smaller in print; where it has subscripts, which are 0.7 of it, these are 6 pt.
 SMALLEST_PT, SYMBOL_PT = 7.0, 8.6
 _MM = 1.0 / 25.4
-
-# A positive parameter this wide (98 over 2 % point) is drawn by its decimal logarithm.
-WIDE = 2.5
 
 _RC: dict[Any, Any] = {
     "font.family": "sans-serif",
@@ -166,9 +164,6 @@ def note(ax: Axes, text: str, *, x: float = 0.03, y: float = 0.97, **kwargs: Any
     )  # fmt: skip
 
 
-_DPI = 150
-
-
 def png(plate: Plate) -> bytes:
     """Render a plate's figure; nothing where it has none."""
     return png_bytes(plate.figure) if plate.figure is not None else b""
@@ -176,10 +171,10 @@ def png(plate: Plate) -> bytes:
 
 def png_bytes(figure: Figure) -> bytes:
     """Render a figure with a palette of 256 colours: a third of the size, no visible loss."""
-    full, small = io.BytesIO(_saved(figure, format="png", dpi=_DPI)), io.BytesIO()
+    full, small = io.BytesIO(_saved(figure, format="png", dpi=DPI)), io.BytesIO()
     few = Image.open(full).convert("RGB").quantize(256)
     # With its resolution, by which a text processor takes it over at its size in print.
-    few.save(small, format="png", dpi=(_DPI, _DPI))
+    few.save(small, format="png", dpi=(DPI, DPI))
     return small.getvalue()
 
 
