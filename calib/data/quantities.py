@@ -46,17 +46,18 @@ def _factor(from_unit: str, to_unit: str) -> float:
     pint, registry = _pint()
     try:
         one, zero = (float(registry.Quantity(x, from_unit).m_as(to_unit)) for x in (1.0, 0.0))
-    except (pint.UndefinedUnitError, pint.DefinitionSyntaxError) as error:
-        raise CalibError(
-            f"unknown unit in the conversion from {from_unit!r} to {to_unit!r} ({error})",
-            expected="units known to pint, such as kPa, psi, kN, mm, g/cm**3, percent",
-            hint="correct the spelling of the unit",
-        ) from None
     except pint.DimensionalityError as error:
         raise CalibError(
             f"cannot convert {from_unit!r} to {to_unit!r}: {error}",
             expected="two units of the same dimension",
             hint="use a unit that measures the same quantity",
+        ) from None
+    # Pint reads a unit as a Python expression, and fails on what is none in many ways.
+    except Exception as error:
+        raise CalibError(
+            f"unknown unit in the conversion from {from_unit!r} to {to_unit!r} ({error})",
+            expected="units known to pint, such as kPa, psi, kN, mm, g/cm**3, percent",
+            hint="correct the spelling of the unit",
         ) from None
     if zero != 0.0:
         raise CalibError(

@@ -49,6 +49,8 @@ def test_conversion_copies_keeps_the_shape_and_nan() -> None:
     ("units", "words"),
     [
         (("furlongz", "m"), ["unknown unit", "furlongz", "expected", "spelling"]),
+        (("kPa'", "m"), ["unknown unit", "kPa'"]),
+        (("(m", "m"), ["unknown unit", "(m"]),
         (("kPa", "kN"), ["cannot convert 'kPa' to 'kN'", "same dimension"]),
         (("degC", "kelvin"), ["their zeros differ", "absolute unit"]),
     ],
