@@ -9,7 +9,7 @@ import numpy as np
 from corner import corner, overplot_lines
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, NullLocator
+from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
 from scipy.stats import gaussian_kde
 
 from calib.inference.calibration import Calibration
@@ -78,9 +78,15 @@ def corner_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Pla
         ax.tick_params(axis="y", labelrotation=0)
         ax.xaxis.set_label_coords(0.5, -away)
         ax.yaxis.set_label_coords(-away, 0.5)
-        for axis in (ax.xaxis, ax.yaxis):
+        for axis, (low, high) in ((ax.xaxis, ax.get_xlim()), (ax.yaxis, ax.get_ylim())):
             axis.label.set_fontsize(SYMBOL_PT)
             axis.label.set_verticalalignment("center")
+            # A label at the end of its panel would meet the next panel's.
+            room_at_ends = 0.1 * (high - low)
+            ticks = [v for v in axis.get_majorticklocs()
+                     if low + room_at_ends <= v <= high - room_at_ends]  # fmt: skip
+            if ticks:
+                axis.set_major_locator(FixedLocator(ticks))
     note = "contours hold 50 % and 90 %" + ("\ndashed: published" if printed else "")
     figure.text(0.98, 0.97, note, va="top", ha="right", fontsize=SMALLEST_PT)
     # Of a pair once, or rounding decides which of the two is named first.
