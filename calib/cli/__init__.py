@@ -47,9 +47,6 @@ def main() -> None:
         raise SystemExit(INTERRUPTED)
 
 
-program = main  # the entry point of installations
-
-
 def _interrupt(number: int, _: object) -> None:
     interrupted.append(number)
     raise KeyboardInterrupt

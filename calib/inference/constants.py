@@ -22,6 +22,7 @@ BROAD_SHARE = (0.08, 0.4)  # of broad draws, if trusted and if not; test_sampler
 ANNEALED = 512  # draws carried from the prior to the posterior; test_modes
 LONG_DATA = 5000  # distinct rows that make an evaluation dear; benchmarks/million.py
 JUDGED = 4096  # draws per ensemble that the gate looks at; test_sampler
+PROPOSED = 0.85  # of steps that draw from the proposal, others are local; test_sampler
 LEAST_LONGER = 1.25  # factor on the length of the next attempt; test_sampler
 LEAST_STEPS = 32  # steps; of fewer, ESS comes out a tenth too large; test_sampler
 

@@ -20,7 +20,14 @@ from scipy.special import logsumexp
 
 from calib.batch.environment import one_thread
 from calib.errors import CalibError
-from calib.inference.constants import ANNEALED, JUDGED, LEAST_LONGER, LEAST_STEPS, LONG_DATA
+from calib.inference.constants import (
+    ANNEALED,
+    JUDGED,
+    LEAST_LONGER,
+    LEAST_STEPS,
+    LONG_DATA,
+    PROPOSED,
+)
 from calib.inference.design import try_simulator
 from calib.inference.diagnostics import (
     LEAST_ENSEMBLES,
@@ -67,7 +74,13 @@ class SamplerSettings:
     gate: Gate = field(default_factory=Gate)
 
     def n_walkers(self, n_dim: int) -> int:
-        """Number of walkers for a dimension."""
+        """Number of walkers for a dimension; a CalibError if emcee cannot move so few."""
+        if self.walkers is not None and self.walkers < 2 * n_dim:
+            raise CalibError(
+                f"{self.walkers} walkers are too few for {n_dim} parameters",
+                expected=f"at least {2 * n_dim}, twice the parameters that are sampled",
+                hint="give more walkers, or leave the setting out",
+            )
         return self.walkers or max(320, 2 * (n_dim + 1))
 
 
@@ -165,7 +178,8 @@ def sample_posterior(
         drawn = priors.sample(rng, max(ANNEALED, walkers))
         annealed = anneal(priors.log_prob, count_rough, drawn, rng)
         if annealed is not None and rough is not problem:
-            annealed = anneal(count_rough, count, annealed[:walkers], rng)
+            some = annealed[rng.permutation(len(annealed))[:walkers]]
+            annealed = anneal(count_rough, count, some, rng)
         if annealed is None:
             raise _nowhere(problem)
         annealed = annealed[rng.permutation(len(annealed))]  # copies stand side by side
@@ -372,6 +386,7 @@ def _neglected(
     from pi, those in a region stand for a part of the proposal q that is proportional to the mean
     of q/pi over them. `steps` is the length of the chain that the draws were taken from. Walkers
     must have entered the region so often that its mass is known as well as by `least_ess` draws.
+    Proposals and entries are counted for the walkers and steps that were kept: a strict count.
     """
     log_ratio = proposal.log_prob(t.reshape(-1, t.shape[-1])).reshape(log_prob.shape) - log_prob
     ratio = np.exp(log_ratio - log_ratio.max())
@@ -401,15 +416,15 @@ def local_moves() -> Moves:
 
 
 def fitted_moves(proposal: Proposal, rng: np.random.Generator) -> Moves:
-    """Independent draws from a proposal in six of seven steps, local moves in the others."""
+    """Independent draws from a proposal in most steps, local moves in the others."""
     import emcee
 
     def draw(coords: Array, _: Any) -> tuple[Array, Array]:
         new, log_q = proposal.draw(rng, len(coords))
         return new, proposal.log_prob(coords) - log_q
 
-    local = [(move, 0.15 * share) for move, share in local_moves()]
-    return [(emcee.moves.MHMove(draw), 0.85), *local]
+    local = [(move, (1.0 - PROPOSED) * share) for move, share in local_moves()]
+    return [(emcee.moves.MHMove(draw), PROPOSED), *local]
 
 
 def run_walkers(

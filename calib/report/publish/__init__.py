@@ -16,6 +16,7 @@ from typing import Any
 from jinja2 import UndefinedError
 
 from calib.data.reader import KNOWN_DATA
+from calib.inference.constants import PROPOSED
 from calib.inference.estimators import METHODS
 from calib.report.document import Output, outputs
 from calib.report.labels import joined
@@ -100,6 +101,7 @@ def methods(manifest: Mapping[str, Any], found: Sequence[Output]) -> list[Paragr
             seed=manifest["seed"], command=shlex.join(map(str, manifest["command"])),
             labels=[label for label in labels if label in KNOWN_DATA], known=KNOWN_DATA,
             genetic=any("genetic" in o.found["estimates"] for o in found),
+            proposed=PROPOSED,
             digits=12,  # of a hash, which tell two files apart; the manifest has all of them
             outputs=[(o, _words(o)) for o in found], format_value=format_value,
         )  # fmt: skip

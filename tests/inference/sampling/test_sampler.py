@@ -311,3 +311,9 @@ def test_draws_are_annealed_to_where_the_density_is_positive() -> None:
     assert (found[:, 0] < edge).all()
     assert len(np.unique(found[:, 0])) > 500
     assert anneal(wide, lambda t: np.full(len(t), -np.inf), draws, rng) is None
+
+
+@pytest.mark.parametrize("walkers", [0, 7])
+def test_too_few_walkers_are_refused(walkers: int) -> None:
+    with pytest.raises(CalibError, match=f"{walkers} walkers are too few for 4 parameters"):
+        SamplerSettings(walkers=walkers).n_walkers(4)
