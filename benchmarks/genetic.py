@@ -20,7 +20,7 @@ from shared.machine import describe, use_one_core
 from shared.measure import spread
 
 from calib.data import Table, hold_out
-from calib.he2019.designs import he2019_tasks
+from calib.he2019.embedded import he2019_tasks
 from calib.inference.estimators import estimate_genetic
 from calib.inference.problem import Problem, build_problem
 from calib.inference.search import PointEstimate, estimate_differential_evolution

@@ -23,7 +23,7 @@ from shared.machine import describe, hold_memory, use_one_core
 from shared.measure import spread
 from shared.peers import pymc_model
 
-from calib.he2019.designs import he2019_tasks
+from calib.he2019.embedded import he2019_tasks
 from calib.inference.diagnostics import Gate, ess
 from calib.inference.problem import Problem, build_problem
 from calib.inference.sampler import SamplerSettings, sample_posterior

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from calib.batch.pool import HERE
 from calib.data import Table, hold_out, table_from_arrays
 from calib.he2019 import embedded
 from calib.he2019.audit import Audit, Seeds, run_audit
-from calib.he2019.gaps import FoundGap, begin_gaps, paper_gaps
+from calib.he2019.gaps import FoundGap, diagnose_gaps, paper_gaps
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import estimate
 from calib.inference.problem import build_problem
@@ -92,7 +91,7 @@ def density_calibration() -> Calibration:
 @pytest.fixture(scope="session")
 def found_gaps() -> dict[str, FoundGap]:
     """The source's own gaps, diagnosed."""
-    found = begin_gaps(SEED, paper_gaps(), HERE)(lambda what, done, planned: None)
+    found = diagnose_gaps(SEED, paper_gaps())
     return {result.gap.name: result for result in found}
 
 

@@ -83,7 +83,7 @@ def report(
         )
     else:
         # The gaps and tables of the source have no place beside the user's own data.
-        from calib.he2019.designs import he2019_tasks
+        from calib.he2019.embedded import he2019_tasks
         from calib.he2019.sections import AuditSection, GapsSection
 
         tasks = he2019_tasks()

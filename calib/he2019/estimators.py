@@ -30,11 +30,6 @@ from calib.inference.problem import Problem
 from calib.inference.search import PointEstimate, goodness, sum_of_squares
 from calib.models.base import Array
 
-_FEWEST_LEVELS = 4
-# More distinct slips than this are averaged in groups, or noise would decide where the peak is.
-_MOST_LEVELS = 40
-_GROUPS = 20
-
 
 class Features(NamedTuple):
     """What the geometric method reads off a curve of pull (kN) against slip (%).
@@ -93,7 +88,7 @@ def read_features(
     """
     slope, zero = _initial_line(slip_percent, pull, slope_slip_percent, find_zero, where)
     x, y = _levels(slip_percent - zero, pull)
-    if x.size < _FEWEST_LEVELS or y.max() <= 0.0 or slope <= 0.0:
+    if x.size < 4 or y.max() <= 0.0 or slope <= 0.0:
         raise CalibError(
             "the geometric method cannot read this curve: it finds "
             f"{x.size} positive slips, a largest pull of {y.max() if x.size else 0.0:g} kN and an "
@@ -139,14 +134,16 @@ def _levels(x: Array, y: Array) -> tuple[Array, Array]:
     """Average repeats at positive slips; average groups of neighbours where slips are many."""
     x, y = x[x > 0.0], y[x > 0.0]
     levels, which = np.unique(np.round(x, 9), return_inverse=True)
-    if levels.size <= _MOST_LEVELS:
+    if levels.size <= 40:
         return levels, np.bincount(which, y) / np.bincount(which)
-    groups = np.array_split(np.argsort(x, kind="stable"), _GROUPS)
+    # Of more slips, noise would decide where the peak is.
+    groups = np.array_split(np.argsort(x, kind="stable"), 20)
     return np.array([x[g].mean() for g in groups]), np.array([y[g].mean() for g in groups])
 
 
-# Eq 9 may give an E above 1, for which the formula has no single peak; G = 1 - E is kept positive.
-_LEAST_G = 0.01
+def _curvature(E: float) -> float:
+    """Return G = 1 - E, kept positive: with an E above 1 the formula has no single peak."""
+    return max(1.0 - E, 0.01)
 
 
 def estimate_geometric(
@@ -188,6 +185,9 @@ def _location(problem: Problem, name: str) -> float:
     return float(np.exp(prior.loc)) if prior.log else prior.loc
 
 
+_NO_PEAK = "no peak inside the range: C is the prior's"
+
+
 def _one_pressure(problem: Problem, up_to: float) -> tuple[dict[str, float], tuple[str, ...]]:
     Sh, Sv = (p for p in problem.priors.entries if p.name in ("Sh", "Sv"))
     shift = Sh.loc if Sh.fixed else 0.0
@@ -198,16 +198,12 @@ def _one_pressure(problem: Problem, up_to: float) -> tuple[dict[str, float], tup
         where=problem.table.source,
     )  # fmt: skip
     B, C, D, E = coefficients(features, _location(problem, "C"))
-    values = {"K": B * C * D, "C": C, "D": D, "G": max(1.0 - E, _LEAST_G)}
+    values = {"K": B * C * D, "C": C, "D": D, "G": _curvature(E)}
     if not Sh.fixed:
         values["Sh"] = features.zero
     if not Sv.fixed:
         values["Sv"] = 0.0
-    return values, (_peak_note(features.has_peak),)
-
-
-def _peak_note(has_peak: bool) -> str:
-    return "" if has_peak else "no peak inside the range: C is the prior's"
+    return values, ("" if features.has_peak else _NO_PEAK,)
 
 
 def _several_pressures(problem: Problem, up_to: float) -> tuple[dict[str, float], tuple[str, ...]]:
@@ -230,17 +226,14 @@ def _several_pressures(problem: Problem, up_to: float) -> tuple[dict[str, float]
     n_basis = 3 if len(groups) > 2 else 2
     values = {"C": float(np.mean([c.C for c in found]))}
     curves = {"K": [c.B * c.C * c.D for c in found], "D": [c.D for c in found],
-              "G": [max(1.0 - c.E, _LEAST_G) for c in found]}  # fmt: skip
+              "G": [_curvature(c.E) for c in found]}  # fmt: skip
     for name, at_pressures in curves.items():
         fit = np.linalg.lstsq(basis[:, :n_basis], np.array(at_pressures), rcond=None)[0]
         values[f"{name}_lo"], values[f"{name}_hi"] = float(fit[0]), float(fit[1])
         if n_basis == 3:
             values[f"{name}_bend"] = 2.0 * float(fit[2] / (fit[0] + fit[1]))
     held = "" if n_basis == 3 else "two pressures: the bends are at the prior's location"
-    return values, (held, _peak_note(all(f.has_peak for f in read)))
-
-
-_MM_PER_M = 1000.0
+    return values, (held, "" if all(f.has_peak for f in read) else _NO_PEAK)
 
 
 @dataclass(frozen=True)
@@ -270,7 +263,7 @@ def rut_regression(problem: Problem, max_slip: float = 0.2) -> RutRegression:
     n_all = len(problem.table)
     slip = problem.table["slip_ratio"] if "slip_ratio" in problem.table else np.zeros(n_all)
     rows = ~(slip > max_slip * (1.0 + 1e-9))
-    ln_z = np.log(problem.observed[rows] / _MM_PER_M)
+    ln_z = np.log(problem.observed[rows] / 1000.0)
     y = np.log(problem.conditions["average_ground_pressure_kpa"][rows])
     regressors = [np.ones_like(ln_z), ln_z] + ([slip[rows] * ln_z] if with_slip else [])
     names = ("k", "n0", "n1") if with_slip else ("k", "n")

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from calib.batch.environment import one_thread
+from calib.batch.pool import HERE
 from calib.data import Table, table_from_arrays, write_table
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
@@ -48,12 +49,14 @@ from calib.report.study import Progress
 
 RECONSTRUCTED = "the data are reconstructed from published results; they are not measurements"
 
-_RUT = ("inflation_pressure_psi", "average_ground_pressure_kpa", "slip_ratio", "rut_depth_mm")
-_PULL = ("inflation_pressure_psi", "slip_ratio", "drawbar_pull_kn")
-_PULL_MODEL = {"drawbar_pull": "magic_formula_pressure"}
-# The wheel hardly slips up to this one: the two smallest nominal slips.
-_TOWED = 0.03
-_WORDS = declared("gaps.toml")
+_COLUMNS = {
+    "bekker": ("inflation_pressure_psi", "average_ground_pressure_kpa", "slip_ratio",
+               "rut_depth_mm"),
+    "magic_formula_pressure": ("inflation_pressure_psi", "slip_ratio", "drawbar_pull_kn"),
+}  # fmt: skip
+_PULL = "magic_formula_pressure"
+
+type Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -86,20 +89,15 @@ def paper_gaps() -> tuple[PaperGap, ...]:
 def _gap(
     case: Case, unfitted: Table | None = None, variants: Mapping[str, Case] | None = None
 ) -> PaperGap:
-    words = _WORDS[case.name]
-    said = {key: " ".join(text.split()) for key, text in words.items()}
+    said = {key: " ".join(text.split()) for key, text in declared("gaps.toml")[case.name].items()}
     return PaperGap(case.name, case=case, unfitted=unfitted, variants=variants or {}, **said)
 
 
 def _plain_bekker() -> PaperGap:
     data = load_he2019("rut_depth")
-    towed, at_30 = data["slip_ratio"] < _TOWED, data["inflation_pressure_psi"] == 30.0
-    unfitted = _rows(data, ~towed & at_30, _RUT, "fresh.csv")
-    case = _case(
-        "plain_bekker", {"rut_depth": "bekker"}, _rows(data, towed, _RUT, "lab.csv"),
-        _rows(data, ~towed & ~at_30, _RUT, "field.csv"), unfitted,
-    )  # fmt: skip
-    return _gap(case, unfitted)
+    # The wheel hardly slips at the two smallest nominal slips, 0 and 2.5 %.
+    towed, at_30 = data["slip_ratio"] < 0.03, data["inflation_pressure_psi"] == 30.0
+    return _gap(*_case("plain_bekker", "bekker", data, ~towed & ~at_30, ~towed & at_30))
 
 
 def _nominal_slip() -> PaperGap:
@@ -108,24 +106,19 @@ def _nominal_slip() -> PaperGap:
     first = _slip_level(data) % 2 == 0
     at_30 = data["inflation_pressure_psi"] == 30.0
 
-    def case(name: str, field_rows: NDArray[np.bool_], *, nominal: bool) -> Case:
-        return _case(
-            name, _PULL_MODEL, _rows(data, ~field_rows, _PULL, "lab.csv"),
-            _rows(data, field_rows & ~at_30, _PULL, "field.csv", nominal=nominal),
-            _rows(data, field_rows & at_30, _PULL, "fresh.csv", nominal=nominal),
-        )  # fmt: skip
+    def case(name: str, there: Mask, *, nominal: bool) -> tuple[Case, Table | None]:
+        return _case(name, _PULL, data, there & ~at_30, there & at_30, nominal=nominal)
 
     variants = {
-        "halves swapped": case("nominal_slip_swapped", ~first, nominal=True),
-        "slips given back": case("nominal_slip_given_back", first, nominal=False),
+        "halves swapped": case("nominal_slip_swapped", ~first, nominal=True)[0],
+        "slips given back": case("nominal_slip_given_back", first, nominal=False)[0],
     }
-    unfitted = _rows(data, first & at_30, _PULL, "fresh.csv", nominal=True)
-    return _gap(case("nominal_slip", first, nominal=True), unfitted, variants)
+    return _gap(*case("nominal_slip", first, nominal=True), variants)
 
 
 def _held_out_pull() -> PaperGap:
     data = load_he2019("drawbar_pull")
-    return _gap(_split("held_out_pull", data, data["inflation_pressure_psi"] == 30.0))
+    return _gap(*_case("held_out_pull", _PULL, data, data["inflation_pressure_psi"] == 30.0))
 
 
 def _post_peak() -> PaperGap:
@@ -134,7 +127,7 @@ def _post_peak() -> PaperGap:
     level = _slip_level(data)
     peak = int(level[at_18][np.argmax(data["drawbar_pull_kn"][at_18])])
     found, later, latest = (
-        _split(name, data, at_18 & (level > peak + i))
+        _case(name, _PULL, data, at_18 & (level > peak + i))[0]
         for i, name in enumerate(("post_peak_18_psi", "post_peak_later", "post_peak_latest"))
     )
     begins = "field begins {} later".format
@@ -142,46 +135,47 @@ def _post_peak() -> PaperGap:
     return _gap(found, variants=variants)
 
 
-def _split(name: str, data: Table, field_rows: NDArray[np.bool_]) -> Case:
-    """Make a case of the pull model whose field is some rows, and its laboratory the others."""
-    return _case(
-        name, _PULL_MODEL, _rows(data, ~field_rows, _PULL, "lab.csv"),
-        _rows(data, field_rows, _PULL, "field.csv"),
-    )  # fmt: skip
-
-
 def _slip_level(data: Table) -> NDArray[np.int64]:
     """Return the place of each row's slip among the slips tested, from 0."""
     return np.unique(data["slip_ratio"], return_inverse=True)[1].astype(np.int64)
 
 
-def _rows(
-    data: Table, mask: NDArray[np.bool_], names: Sequence[str], file: str, *, nominal: bool = False
-) -> Table:
-    """Return some rows of the embedded data as a table, nominal slips in the place of slips."""
-    columns = {
-        name: data["nominal_slip_ratio" if nominal and name == "slip_ratio" else name][mask]
-        for name in names
-    }
-    return _table(columns, file)
+def _case(
+    name: str, model: str, data: Table, there: Mask, kept_out: Mask | None = None, *,
+    nominal: bool = False,
+) -> tuple[Case, Table | None]:  # fmt: skip
+    """Make a case of embedded data whose field is the rows `there`, and its laboratory the rest.
+
+    Rows kept out of both are returned apart, in the case by their conditions. `nominal` puts
+    nominal slips in the place of slips outside the laboratory.
+    """
+
+    def rows(mask: Mask, file: str, *, nominal: bool) -> Table:
+        return _table(
+            {n: data["nominal_slip_ratio" if nominal and n == "slip_ratio" else n][mask]
+             for n in _COLUMNS[model]}, file,
+        )  # fmt: skip
+
+    unfitted = new = None
+    lab, output = ~there, _COLUMNS[model][-1]
+    if kept_out is not None:
+        lab &= ~kept_out
+        unfitted = rows(kept_out, "fresh.csv", nominal=nominal)
+        new = _table({n: v for n, v in unfitted.columns.items() if n != output}, "fresh.csv")
+    models = {next(key for key, column in OUTPUTS.items() if column == output): model}
+    case = Case(
+        name, rows(lab, "lab.csv", nominal=False), rows(there, "field.csv", nominal=nominal),
+        models, new, (RECONSTRUCTED,),
+    )  # fmt: skip
+    return case, unfitted
 
 
-def _table(columns: Mapping[str, NDArray[np.float64]], file: str) -> Table:
+def _table(columns: Mapping[str, Array], file: str) -> Table:
     """Make a table that carries the hash of the file `calib.data.write_table` makes of it."""
     cells = zip(*(map(repr, values.tolist()) for values in columns.values()), strict=True)
     text = "".join(f"{','.join(row)}\n" for row in [tuple(columns), *cells])
     table = table_from_arrays(columns, source=file, label=LABEL)
     return replace(table, sha256=hashlib.sha256(text.encode()).hexdigest())
-
-
-def _case(
-    name: str, models: Mapping[str, str], lab: Table, field: Table, unfitted: Table | None = None
-) -> Case:
-    new = None
-    if unfitted is not None:
-        conditions = {n: v for n, v in unfitted.columns.items() if n not in OUTPUTS.values()}
-        new = _table(conditions, "fresh.csv")
-    return Case(name, lab, field, models, new, (RECONSTRUCTED,))
 
 
 def write_cases(gaps: Sequence[PaperGap], out: Path, *, overwrite: bool = False) -> list[Path]:
@@ -226,11 +220,6 @@ def _case_toml(gap: PaperGap) -> str:
 
 # The diagnoses, and what the source printed
 
-_N_DRAWS = 20_000
-_NEGLIGIBLE = 1e-9
-# Fewer effective draws do not give an sd to 5 %.
-_LEAST_ESS = 400.0
-
 
 @dataclass(frozen=True)
 class FoundGap:
@@ -256,44 +245,24 @@ class FoundGap:
         return self.found.data.names[0]
 
 
-@dataclass(frozen=True)
-class Unfitted:
-    """Errors of predictions at n rows in neither campaign: rms, and the largest relative one.
-
-    Before by the calibrated simulator, after by the corrected model, within whose 90 % predictive
-    band `covered` of them lie.
-    """
-
-    n: int
-    covered: int
-    rmse_before: float
-    rmse_after: float
-    largest_before: float
-    largest_after: float
-
-
-def begin_gaps(
-    seed: int, gaps: Sequence[PaperGap], pool: Executor
-) -> Callable[[Progress], tuple[FoundGap, ...]]:
-    """Ask for the diagnoses of gaps and of their variants; return what waits for them."""
+def diagnose_gaps(
+    seed: int, gaps: Sequence[PaperGap], pool: Executor = HERE, progress: Progress | None = None
+) -> tuple[FoundGap, ...]:
+    """Diagnose gaps and their variants; the numbers do not depend on the pool."""
+    tell = progress or (lambda what, done, planned: None)
     asked = [
         (gap, pool.submit(_with_sd, gap.case, seed),
          {name: pool.submit(diagnose, case, seed) for name, case in gap.variants.items()})
         for gap in gaps
     ]  # fmt: skip
-    planned = sum(1 + len(gap.variants) for gap in gaps)
-
-    def finish(tell: Progress) -> tuple[FoundGap, ...]:
-        results = []
-        for gap, piece, pieces in asked:
-            found, open_sd = piece.result()
-            variants = {name: variant.result() for name, variant in pieces.items()}
-            results.append(FoundGap(gap, found, variants, open_sd))
-            done = sum(1 + len(r.variants) for r in results)
-            tell("the paper's own gaps: diagnosing", done, planned)
-        return tuple(results)
-
-    return finish
+    results: list[FoundGap] = []
+    for gap, piece, pieces in asked:
+        found, open_sd = piece.result()
+        variants = {name: variant.result() for name, variant in pieces.items()}
+        results.append(FoundGap(gap, found, variants, open_sd))
+        done, planned = (sum(1 + len(g.variants) for g in some) for some in (results, gaps))
+        tell("the paper's own gaps: diagnosing", done, planned)
+    return tuple(results)
 
 
 @one_thread()
@@ -314,62 +283,47 @@ def simulator_sd(found: Diagnosis) -> Array:
     modes = find_modes(log_prob, priors, rng)
     guesses = [Guess(m.t, np.linalg.cholesky(m.covariance)) for m in modes]
     proposal, _ = adapt(log_prob, guesses, rng)
-    drawn, log_q = proposal.draw(rng, _N_DRAWS)
+    drawn, log_q = proposal.draw(rng, n := 20_000)
     log_weight = log_prob(drawn) - log_q
     weight = np.exp(log_weight - logsumexp(log_weight))
     # What hardly weighs may lie so far out that the model's value overflows.
-    inside = weight > _NEGLIGIBLE / _N_DRAWS
+    inside = weight > 1e-9 / n
     conditions = o.problem.bound.model.select(found.data.view.conditions)
     theta = o.problem.theta(drawn[inside])[:, :-1]
     predicted = o.problem.bound.predict(theta, conditions)[:, o.rows]
     w = weight[inside]
-    if 1.0 / np.square(w).sum() < _LEAST_ESS:
+    # Fewer effective draws do not give an sd to 5 %.
+    if 1.0 / np.square(w).sum() < 400.0:
         return np.full(o.rows.size, np.nan)
     return np.asarray(np.sqrt(w @ np.square(predicted - w @ predicted)))
 
 
-def unfitted_errors(found: Diagnosis, gap: PaperGap) -> Unfitted | None:
-    """Compare predictions with the outcomes that were kept out; None where none were."""
-    if gap.unfitted is None:
-        return None
-    output = found.data.names[0]
-    measured, p = gap.unfitted[OUTPUTS[output]], found.new_predictions[output]
-    before, after = measured - p.before, measured - p.after
-    covered = int(((measured >= p.lower) & (measured <= p.upper)).sum())
-    largest = (float(np.abs(error / measured).max()) for error in (before, after))
-    return Unfitted(measured.size, covered, _rms(before), _rms(after), *largest)
+type Checks = dict[str, dict[str, float]]
 
 
-_FITTED_SLIP = 0.0125  # the middle of the slips at which plain Bekker was calibrated
-_Z_90 = 1.645
-
-
-@dataclass(frozen=True)
-class Check:
-    """One comparison: all numbers in it, by names with their units."""
-
-    name: str
-    values: Mapping[str, float]
-
-
-def checks(result: FoundGap) -> tuple[Check, ...]:
-    """Return the comparisons of a gap, in reading order."""
+def checks(result: FoundGap) -> Checks:
+    """Return the comparisons of a gap in reading order: numbers by names with their units."""
     own = _OWN[result.gap.name](result)
-    e = unfitted_errors(result.found, result.gap)
-    if e is None:
+    unfitted, output = result.gap.unfitted, result.output
+    if unfitted is None:
         return own
-    unit = OUTPUTS[result.output].rpartition("_")[2]
+    # Predictions at rows in neither campaign, by the calibrated simulator and the corrected model.
+    measured, p = unfitted[OUTPUTS[output]], result.found.new_predictions[output]
+    before, after = measured - p.before, measured - p.after
+    unit = OUTPUTS[output].rpartition("_")[2]
     values = {
-        "rows": float(e.n), "in_90_band": float(e.covered),
-        f"rmse_before_{unit}": e.rmse_before, f"rmse_after_{unit}": e.rmse_after,
+        "rows": float(measured.size),
+        "in_90_band": float(((measured >= p.lower) & (measured <= p.upper)).sum()),
+        f"rmse_before_{unit}": _rms(before), f"rmse_after_{unit}": _rms(after),
     }  # fmt: skip
-    if result.output == "rut_depth":  # a pull near zero has no relative error to speak of
+    if output == "rut_depth":  # a pull near zero has no relative error to speak of
         published = PUBLISHED.rut_depth.quality["held_out_max_relative_error"].value
         values |= {
-            "largest_relative_before": e.largest_before,
-            "largest_relative_after": e.largest_after, "largest_relative_published": published,
-        }  # fmt: skip
-    return *own, Check("kept_out_rows", values)
+            "largest_relative_before": float(np.abs(before / measured).max()),
+            "largest_relative_after": float(np.abs(after / measured).max()),
+            "largest_relative_published": published,
+        }
+    return own | {"kept_out_rows": values}
 
 
 def probability_of(found: Diagnosis, effect: str) -> float:
@@ -378,7 +332,7 @@ def probability_of(found: Diagnosis, effect: str) -> float:
     return float(sum(v for name, v in p.items() if effect in name.split("+")))
 
 
-def _bekker_checks(result: FoundGap) -> tuple[Check, ...]:
+def _bekker_checks(result: FoundGap) -> Checks:
     found = result.found
     o, truth = found.data.outputs[0], found.truth
     slip = found.data.view.conditions["slip_ratio"][o.rows]
@@ -388,24 +342,24 @@ def _bekker_checks(result: FoundGap) -> tuple[Check, ...]:
     deepening = ratio[:, o.rows][:, deepest].mean(axis=1)
     low, middle, high = (float(truth.quantile(deepening[:, None], q)[0]) for q in (0.05, 0.5, 0.95))
     k, n0, n1 = (PUBLISHED.rut_depth.values[name] for name in ("k", "n0", "n1"))
-    at_20, towed = (
-        eq_21(pressure[deepest], s, k, n0, n1) for s in (float(slip.max()), _FITTED_SLIP)
-    )
-    return (
-        Check("alone_or_with_another", {"probability": probability_of(found, "slip_sinkage")}),
-        Check("deepening_at_20_percent_slip",
-              {"median": middle, "lower_90": low, "upper_90": high,
-               "eq_21_with_table_6": float((at_20 / towed).mean())}),
-    )  # fmt: skip
+    # Plain Bekker was calibrated at slips about 1.25 %.
+    at_20, towed = (eq_21(pressure[deepest], s, k, n0, n1) for s in (float(slip.max()), 0.0125))
+    return {
+        "alone_or_with_another": {"probability": probability_of(found, "slip_sinkage")},
+        "deepening_at_20_percent_slip": {
+            "median": middle, "lower_90": low, "upper_90": high,
+            "eq_21_with_table_6": float((at_20 / towed).mean()),
+        },
+    }  # fmt: skip
 
 
-def _slip_checks(result: FoundGap) -> tuple[Check, ...]:
+def _slip_checks(result: FoundGap) -> Checks:
     swapped, back = (result.variants[name] for name in ("halves swapped", "slips given back"))
-    return (
-        Check("shift_at_zero_slip", _shift(result.found) | {"withheld_percent": 100 * SLIP_SHIFT}),
-        Check("halves_swapped", _shift(swapped)),
-        Check("slips_given_back", {"probability_none": float(back.ranking.probability["none"])}),
-    )
+    return {
+        "shift_at_zero_slip": _shift(result.found) | {"withheld_percent": 100 * SLIP_SHIFT},
+        "halves_swapped": _shift(swapped),
+        "slips_given_back": {"probability_none": float(back.ranking.probability["none"])},
+    }
 
 
 def _shift(found: Diagnosis) -> dict[str, float]:
@@ -416,11 +370,11 @@ def _shift(found: Diagnosis) -> dict[str, float]:
     return {
         "probability": float(found.ranking.probability[name]),
         "mean_percent": mean, "sd_percent": sd,
-        "lower_90_percent": mean - _Z_90 * sd, "upper_90_percent": mean + _Z_90 * sd,
+        "lower_90_percent": mean - 1.645 * sd, "upper_90_percent": mean + 1.645 * sd,
     }  # fmt: skip
 
 
-def _pull_checks(result: FoundGap) -> tuple[Check, ...]:
+def _pull_checks(result: FoundGap) -> Checks:
     found = result.found
     o = found.data.outputs[0]
     none = found.ranking.fits["none"][0]
@@ -430,31 +384,36 @@ def _pull_checks(result: FoundGap) -> tuple[Check, ...]:
     theta = priors.to_natural(none.psi[None, part])
     conditions = o.problem.bound.model.select(found.data.view.conditions)
     refitted = o.problem.bound.predict(theta, conditions)[0][o.rows]
-    left = found.data.case.field[OUTPUTS[o.name]][o.rows] - refitted
-    return (
-        Check("miss_against_what_was_open",
-              {"miss_rms_kn": _rms(_miss(found)), "simulator_sd_rms_kn": _rms(result.open_sd),
-               "noise_sd_kn": none.noise[o.name].sigma}),
-        Check("no_effect_fitted_to_all",
-              {"miss_rms_kn": _rms(left),
-               "largest_bend_prior_sd": float(np.max(np.abs(moved)))}),
-    )  # fmt: skip
-
-
-def _peak_checks(result: FoundGap) -> tuple[Check, ...]:
-    p = result.found.ranking.probability
-    softening = probability_of(result.found, "post_peak_softening")
-    what = {
-        "probability_some_gap": 1.0 - float(p["none"]),
-        "probability_post_peak_softening": softening, "probability_unknown": float(p["unknown"]),
+    before = found.corrected.calibrated(found.data.view.conditions)[o.name][o.rows]
+    measured = found.data.case.field[OUTPUTS[o.name]][o.rows]
+    return {
+        "miss_against_what_was_open": {
+            "miss_rms_kn": _rms(measured - before), "simulator_sd_rms_kn": _rms(result.open_sd),
+            "noise_sd_kn": none.noise[o.name].sigma,
+        },
+        "no_effect_fitted_to_all": {
+            "miss_rms_kn": _rms(measured - refitted),
+            "largest_bend_prior_sd": float(np.max(np.abs(moved))),
+        },
     }  # fmt: skip
-    found = [Check("what_it_could_be", what)]
+
+
+def _peak_checks(result: FoundGap) -> Checks:
+    p = result.found.ranking.probability
+    found = {
+        "what_it_could_be": {
+            "probability_some_gap": 1.0 - float(p["none"]),
+            "probability_post_peak_softening": probability_of(result.found, "post_peak_softening"),
+            "probability_unknown": float(p["unknown"]),
+        }
+    }
     for name, other in result.variants.items():
         best, p = other.ranking.order[0], other.ranking.probability
-        values = {"rows": float(other.data.outputs[0].rows.size)}
-        values |= {f"probability_{h}": float(p[h]) for h in ("none", best)}
-        found.append(Check(name.replace(" ", "_"), values))
-    return (*found, Check("costs_in_table_4", _table_4_costs()))
+        found[name.replace(" ", "_")] = {
+            "rows": float(other.data.outputs[0].rows.size),
+            **{f"probability_{h}": float(p[h]) for h in ("none", best)},
+        }
+    return found | {"costs_in_table_4": _table_4_costs()}
 
 
 def _table_4_costs() -> dict[str, float]:
@@ -476,17 +435,11 @@ def _table_4_costs() -> dict[str, float]:
     }  # fmt: skip
 
 
-def _miss(found: Diagnosis) -> Array:
-    o = found.data.outputs[0]
-    before = found.corrected.calibrated(found.data.view.conditions)[o.name][o.rows]
-    return np.asarray(found.data.case.field[OUTPUTS[o.name]][o.rows] - before)
-
-
 def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-_OWN: Mapping[str, Callable[[FoundGap], tuple[Check, ...]]] = {
+_OWN: Mapping[str, Callable[[FoundGap], Checks]] = {
     "plain_bekker": _bekker_checks, "nominal_slip": _slip_checks,
     "held_out_pull": _pull_checks, "post_peak_18_psi": _peak_checks,
 }  # fmt: skip
@@ -494,20 +447,21 @@ _OWN: Mapping[str, Callable[[FoundGap], tuple[Check, ...]]] = {
 
 def summarise_gaps(results: Sequence[FoundGap]) -> dict[str, Any]:
     """Return verdict, probabilities, rows, checks and variants as plain dictionaries by gap."""
-    return {result.gap.name: _one(result) for result in results}
-
-
-def _one(result: FoundGap) -> dict[str, Any]:
-    found = result.found
     return {
-        "models": dict(found.data.case.models),
-        "rows": {"calibration": len(found.data.case.lab), "field": len(found.data.case.field)},
-        "withheld": result.gap.withheld,
-        **answer(contract(result.document)),
-        "open_sd_rms": float((result.open_sd**2).mean() ** 0.5),
-        "checks": {check.name: dict(check.values) for check in checks(result)},
-        "variants": {name: _answer(other) for name, other in result.variants.items()},
-        "warnings": list(found.warnings),
+        result.gap.name: {
+            "models": dict(result.found.data.case.models),
+            "rows": {
+                "calibration": len(result.found.data.case.lab),
+                "field": len(result.found.data.case.field),
+            },
+            "withheld": result.gap.withheld,
+            **answer(contract(result.document)),
+            "open_sd_rms": float((result.open_sd**2).mean() ** 0.5),
+            "checks": checks(result),
+            "variants": {name: _answer(other) for name, other in result.variants.items()},
+            "warnings": list(result.found.warnings),
+        }
+        for result in results
     }
 
 

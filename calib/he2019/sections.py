@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 import shlex
@@ -22,15 +23,15 @@ from calib.he2019.audit import (
     Seeds,
     Verdict,
     audit_csv,
+    audit_document,
     audit_json,
-    begin_audit,
+    run_audit,
 )
 from calib.he2019.gaps import (
-    Check,
     FoundGap,
     PaperGap,
-    begin_gaps,
     checks,
+    diagnose_gaps,
     paper_gaps,
     probability_of,
     summarise_gaps,
@@ -39,17 +40,13 @@ from calib.he2019.published import DOI
 from calib.models import get_model
 from calib.report.figures.plate import Plate
 from calib.report.gap_words import gap_verdict, short_name
-from calib.report.labels import odds_text, percent, percent_range, unbroken
+from calib.report.labels import MINUS, odds_text, percent, percent_range, unbroken
 from calib.report.markup import unit_html
 from calib.report.numbers import NOTHING, format_number
 from calib.report.page.diagnosis import TONE_MARKS, render_page
 from calib.report.page.template import data_uri, picture, png_size, sentences, template
 from calib.report.sections import Section, Target
 from calib.report.study import Progress, Study
-
-_TITLE = "Audit of the published tables: He, Sandu & Osorio (2019)"
-_MINUS = "\N{MINUS SIGN}"
-_DIGITS = 4
 
 # A shape beside every word.
 AUDIT_MARKS: Mapping[Verdict, str] = {
@@ -71,7 +68,7 @@ def write_audit(audit: Audit, folder: Path) -> str:
     from calib.report.figures.style import png
 
     (folder / "audit.json").write_text(audit_json(audit), encoding="utf-8")
-    (folder / "audit.csv").write_text(audit_csv(audit.findings), encoding="utf-8")
+    (folder / "audit.csv").write_text(audit_csv(audit_document(audit)), encoding="utf-8")
     plates = audit_plates(audit)
     images = {p.name: png(p) for p in plates if p.figure is not None}
     (folder / "figures").mkdir(exist_ok=True)
@@ -83,8 +80,8 @@ def write_audit(audit: Audit, folder: Path) -> str:
 def write_audit_page(audit: Audit, folder: Path, command: Sequence[str]) -> None:
     """Write what `write_audit` does, and ``index.html``, into an existing folder."""
     page = template("audit_page.html.j2", "calib.he2019").render(
-        title=_TITLE, section=Markup(write_audit(audit, folder)), seed=audit.seed, doi=DOI,
-        command=shlex.join(command),
+        title="Audit of the published tables: He, Sandu & Osorio (2019)", seed=audit.seed,
+        section=Markup(write_audit(audit, folder)), doi=DOI, command=shlex.join(command),
     )  # fmt: skip
     (folder / "index.html").write_text(page, encoding="utf-8")
 
@@ -111,7 +108,7 @@ def audit_section(audit: Audit, plates: Sequence[Plate], images: Mapping[str, by
 
 def _text(text: str) -> str:
     """Write minus signs and powers as a reader expects them."""
-    signed = re.sub(r"(?<![\w.])-(?=[\d.,)])", _MINUS, text)
+    signed = re.sub(r"(?<![\w.])-(?=[\d.,)])", MINUS, text)
     return unbroken(re.sub(r"(kN|psi|R|g/cm)\^([23])", lambda m: m[1] + "²³"[m[2] == "3"], signed))
 
 
@@ -127,19 +124,16 @@ def _row(finding: Finding) -> dict[str, Any]:
 
 def _quantity(q: Quantity) -> dict[str, Any]:
     unit = "" if q.unit == "1" else Markup(" {}").format(unit_html(q.unit))
-
-    def shown(text: str) -> Any:
-        return Markup("{}{}").format(text, unit)
-
-    interval = NOTHING
-    if not math.isnan(q.lower):
-        low, high = (format_number(v, _DIGITS) for v in (q.lower, q.upper))
-        interval = f"{low} to {high}" if low != high else low
-        if math.isnan(q.value):
-            interval = shown(interval)
+    value, low, high = (format_number(v, 4) for v in (q.value, q.lower, q.upper))
+    interval = NOTHING if math.isnan(q.lower) else f"{low} to {high}" if low != high else low
+    # The unit stands beside the value, or beside the interval where there is nothing else.
+    if math.isnan(q.value):
+        value = NOTHING
+        interval = Markup("{}{}").format(interval, unit) if interval != NOTHING else interval
+    else:
+        value = Markup("{}{}").format(value, unit)
     return {
-        "name": _text(q.name), "interval": interval, "kind": q.interval or NOTHING,
-        "value": NOTHING if math.isnan(q.value) else shown(format_number(q.value, _DIGITS)),
+        "name": _text(q.name), "value": value, "interval": interval, "kind": q.interval or NOTHING,
         "published": _text(q.published) or NOTHING,
     }  # fmt: skip
 
@@ -150,16 +144,15 @@ _ABSENT = dict.fromkeys(("rmse_before_mm", "rmse_after_mm", "largest_relative_af
 _said = sentences(odds=odds_text)
 
 
-def check_text(check: Check) -> tuple[str, str]:
+def check_text(name: str, values: Mapping[str, float]) -> tuple[str, str]:
     """Return the heading of a check and what it found."""
-    words = _CHECKS.get(check.name)
+    words = _CHECKS.get(name)
     if words is not None:
-        return words["heading"], _said(words["text"], **{**_ABSENT, **check.values})
+        return words["heading"], _said(words["text"], **{**_ABSENT, **values})
     # The same question asked otherwise: the probabilities.
-    named = ((k.removeprefix("probability_"), p) for k, p in check.values.items() if k != "rows")
+    named = ((k.removeprefix("probability_"), p) for k, p in values.items() if k != "rows")
     listed = ", ".join(f"{short_name(name)} {odds_text(p)}" for name, p in named)
-    heading = check.name.replace("_", " ").capitalize()
-    return heading, f"{check.values['rows']:.0f} field rows: {listed}"
+    return name.replace("_", " ").capitalize(), f"{values['rows']:.0f} field rows: {listed}"
 
 
 def _write_gap(
@@ -190,6 +183,7 @@ def _block(result: FoundGap, plate: Plate, image: bytes) -> dict[str, Any]:
     gap, found = result.gap, result.found
     verdict, ranking, case = gap_verdict(result.document), found.ranking, found.data.case
     best = ranking.order[0]
+    named = best == gap.withheld and found.verdict == "effect"
     s = found.shrink.get(result.output)
     return {
         "name": gap.name, "title": gap.title, "question": gap.question, "limits": gap.limits,
@@ -201,11 +195,12 @@ def _block(result: FoundGap, plate: Plate, image: bytes) -> dict[str, Any]:
         "tone": verdict.tone.value, "mark": TONE_MARKS[verdict.tone], "state": verdict.state,
         "headline": verdict.headline,
         "facts": [fact for fact in verdict.facts if fact[0] not in ("Next", "Then")],
-        "withheld": _withheld(result),
+        "withheld": gap.withheld and short_name(gap.withheld), "named": named,
+        "withheld_odds": gap.withheld and odds_text(probability_of(found, gap.withheld)),
         "best": f"{short_name(best)} ({odds_text(ranking.probability[best])})",
         "shrink": f"{percent(s.fraction)} ({percent_range(s.interval)})" if s
         else "no gap that could shrink",
-        "checks": [check_text(check) for check in checks(result)],
+        "checks": [check_text(*check) for check in checks(result).items()],
         "page": f"gaps/{gap.name}/index.html", "caption": plate.caption, "uri": data_uri(image),
         "size": png_size(image),
     }  # fmt: skip
@@ -213,22 +208,6 @@ def _block(result: FoundGap, plate: Plate, image: bytes) -> dict[str, Any]:
 
 def _upper(text: str) -> str:
     return text[0].upper() + text[1:]
-
-
-def _withheld(result: FoundGap) -> str:
-    """Say whether the effect that was withheld is the one that was found."""
-    effect = result.gap.withheld
-    if effect is None:
-        return ""
-    ranking = result.found.ranking
-    words = short_name(effect)
-    if ranking.order[0] == effect and result.found.verdict == "effect":
-        return f"The effect that was withheld, {words}, is the one that is named."
-    p = odds_text(probability_of(result.found, effect))
-    return (
-        f"The effect that was withheld, {words}, is not the one that is named: its probability, "
-        f"alone or with another, is {p}."
-    )
 
 
 # The sections, as the report asks for them
@@ -242,9 +221,19 @@ class GapsSection(Section[tuple[FoundGap, ...]]):
     name, anchor, badge = "paper_gaps", "paper-gaps", "reconstructed data"
     heading = "Where the paper's own models miss"
 
+    @classmethod
+    def again(cls, record: Any) -> GapsSection:
+        """Return the section of a manifest's record; raise ValueError if it is none."""
+        known = {gap.name: gap for gap in paper_gaps()}
+        if not isinstance(record, dict):
+            raise ValueError("not a table of gaps by name")
+        if strange := sorted(set(record) - set(known)):
+            raise ValueError(f"{strange[0]!r} is not one of {', '.join(known)}")
+        return cls(tuple(gap for name, gap in known.items() if name in record))
+
     def work_out(self, study: Study, pool: Executor, tell: Progress) -> tuple[FoundGap, ...]:
         """Diagnose the gaps."""
-        return begin_gaps(study.seed, self.gaps, pool)(tell)
+        return diagnose_gaps(study.seed, self.gaps, pool, tell)
 
     def summary(self, part: tuple[FoundGap, ...]) -> dict[str, Any]:
         """Return the numbers by the gaps' names."""
@@ -276,11 +265,31 @@ class AuditSection(Section[Audit]):
     seeds: Seeds = field(default_factory=Seeds)
     name, anchor, heading = "audit", "audit", "Audit of the published tables"
 
+    @classmethod
+    def again(cls, record: Any) -> AuditSection:
+        """Return the section of a manifest's record; raise ValueError if it is none."""
+        seeds, names = record.get("seeds") if isinstance(record, dict) else None, asdict(Seeds())
+        if not isinstance(seeds, dict) or set(seeds) != set(names):
+            raise ValueError(f"seeds: not {', '.join(sorted(names))}")
+        wrong = [name for name, n in seeds.items() if not (isinstance(n, int) and 1 <= n <= 1000)]
+        if wrong:
+            raise ValueError(f"seeds: {', '.join(wrong)}: not a whole number from 1 to 1000")
+        return cls(Seeds(**seeds))
+
+    @staticmethod
+    def derived(folder: Path, files: Mapping[str, str]) -> dict[str, str]:
+        """Return the table of findings, which follows from the audit's document."""
+        if "audit.json" not in files or not (folder / "audit.json").is_file():
+            return {}
+        return {"audit.csv": audit_csv(json.loads((folder / "audit.json").read_bytes()))}
+
     def work_out(self, study: Study, pool: Executor, tell: Progress) -> Audit:
         """Audit the tables, with the study's calibration of rut depth if it has one."""
         rut = study.successes.get("rut_depth")
-        begun = begin_audit(study.seed, self.seeds, pool)
-        return begun(None if rut is None else rut.calibration, tell)
+        return run_audit(
+            study.seed, seeds=self.seeds, rut_calibration=None if rut is None else rut.calibration,
+            progress=tell, pool=pool,
+        )  # fmt: skip
 
     def record(self, part: Audit) -> dict[str, Any]:
         """Return its seed, and how often searches were repeated."""

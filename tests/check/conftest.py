@@ -25,7 +25,7 @@ from calib.check.check import Outcome, check, recompute_report
 from calib.check.compare import Status
 from calib.gap.diagnose import diagnose
 from calib.he2019 import sections
-from calib.he2019.audit import begin_audit
+from calib.he2019.audit import run_audit
 from calib.inference.io import recompute_run
 from calib.report.publish import publication
 from calib.report.writer import file_hashes
@@ -97,16 +97,13 @@ def audited_once(_made, monkeypatch: pytest.MonkeyPatch) -> None:
     """Audit once with the same calibration."""
     cache, _ = _made
 
-    def audit_again(seed, seeds, pool):
-        def finish(calibration, tell):
-            key = "audit", seed, seeds, calibration and calibration.draws.t.tobytes()
-            if key not in cache:
-                cache[key] = begin_audit(seed, seeds, pool)(calibration, tell)
-            return cache[key]
+    def audit_again(seed, *, seeds, rut_calibration, **how):
+        key = "audit", seed, seeds, rut_calibration and rut_calibration.draws.t.tobytes()
+        if key not in cache:
+            cache[key] = run_audit(seed, seeds=seeds, rut_calibration=rut_calibration, **how)
+        return cache[key]
 
-        return finish
-
-    monkeypatch.setattr(sections, "begin_audit", audit_again)
+    monkeypatch.setattr(sections, "run_audit", audit_again)
 
 
 @pytest.fixture

@@ -15,8 +15,7 @@ from unittest.mock import patch
 
 from calib.data import hold_out, read_table
 from calib.he2019.audit import Seeds
-from calib.he2019.designs import he2019_tasks
-from calib.he2019.embedded import load_he2019
+from calib.he2019.embedded import he2019_tasks, load_he2019
 from calib.he2019.gaps import paper_gaps
 from calib.he2019.sections import AuditSection, GapsSection
 from calib.inference.calibration import Calibration, calibrate

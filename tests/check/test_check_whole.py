@@ -13,7 +13,7 @@ import pytest
 
 from calib.check.check import check
 from calib.check.compare import Status
-from calib.he2019.audit import audit_csv, read_findings
+from calib.he2019.audit import audit_csv
 from tests.check.conftest import different, edit_json, findings, in_text, seal, swap_figures
 
 pytestmark = pytest.mark.usefixtures("computed_once")
@@ -123,7 +123,7 @@ def change_verdict(whole: Path) -> None:
 
 
 def rewrite_audit_csv(whole: Path) -> None:
-    found = read_findings(json.loads((whole / "audit.json").read_text()))
+    found = json.loads((whole / "audit.json").read_text())
     (whole / "audit.csv").write_text(audit_csv(found), encoding="utf-8")
 
 

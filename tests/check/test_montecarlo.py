@@ -12,7 +12,7 @@ from calib.check.tolerances import (
     multiple,
     posterior_errors,
 )
-from calib.he2019.designs import he2019_tasks
+from calib.he2019.embedded import he2019_tasks
 from calib.report.document import summarise
 from calib.report.sections import work_out
 

@@ -17,7 +17,7 @@ import pytest
 
 from calib.batch.pool import HERE, pool
 from calib.he2019.audit import Seeds, audit_json
-from calib.he2019.designs import he2019_tasks
+from calib.he2019.embedded import he2019_tasks
 from calib.he2019.gaps import paper_gaps
 from calib.he2019.sections import AuditSection, GapsSection
 from calib.inference.sampler import SamplerSettings

@@ -72,13 +72,13 @@ def test_the_report_of_the_embedded_data_has_the_section(
     """The command passes the gaps on; what is tested elsewhere is left out here."""
     asked = []
 
-    def begin(seed, *_):
+    def diagnosed(seed, *_):
         asked.append(seed)
-        return lambda tell: (found_gaps["plain_bekker"],)
+        return (found_gaps["plain_bekker"],)
 
-    monkeypatch.setattr("calib.he2019.designs.he2019_tasks", lambda: ())
-    monkeypatch.setattr("calib.he2019.sections.begin_gaps", begin)
-    monkeypatch.setattr("calib.he2019.sections.begin_audit", lambda *_: lambda *_: audit)
+    monkeypatch.setattr("calib.he2019.embedded.he2019_tasks", lambda: ())
+    monkeypatch.setattr("calib.he2019.sections.diagnose_gaps", diagnosed)
+    monkeypatch.setattr("calib.he2019.sections.run_audit", lambda *_, **how: audit)
     ran = calib("report", "--out", "rep", "--seed", 5)
     assert ran.code == 0, ran.err
     assert asked == [5]

@@ -34,7 +34,6 @@ from calib.he2019.audit.bounds import (
     square,
     tan,
 )
-from calib.he2019.embedded import columns
 from calib.he2019.published import PUBLISHED
 from calib.models.magic_formula import magic_formula
 from calib.report.reference import Figure
@@ -52,6 +51,7 @@ def inside(i: Interval, share: float) -> float:
     return min(max(low + share * (high - low), low), high)
 
 
+@settings(max_examples=50)
 @given(FINITE, FINITE, FINITE, FINITE, st.floats(0, 1), st.floats(0, 1))
 def test_the_exact_result_of_any_two_numbers_lies_inside(a, b, c, d, s, t):
     x, y = interval(a, b), interval(c, d)
@@ -65,16 +65,11 @@ def test_the_exact_result_of_any_two_numbers_lies_inside(a, b, c, d, s, t):
         # An end beyond the largest number is infinite: it bounds nothing, rightly.
         assert np.isinf(low) or Fraction(low) <= true, name
         assert np.isinf(high) or true <= Fraction(high), name
-
-
-@given(FINITE, FINITE, FINITE, FINITE)
-def test_no_wider_than_the_corners_but_for_rounding(a, b, c, d):
-    x, y = interval(a, b), interval(c, d)
+    # No wider than the corners but for rounding.
     corners = [Fraction(p) * Fraction(q) for p in (a, b) for q in (c, d)]
-    found = x * y
     slack = 1e-14 * max(1.0, float(max(map(abs, corners))))
-    assert float(found.upper) <= float(max(corners)) + slack
-    assert float(found.lower) >= float(min(corners)) - slack
+    assert float((x * y).upper) <= float(max(corners)) + slack
+    assert float((x * y).lower) >= float(min(corners)) - slack
 
 
 @pytest.mark.parametrize(
@@ -82,6 +77,7 @@ def test_no_wider_than_the_corners_but_for_rounding(a, b, c, d):
     [(arctan, np.arctan, -50.0, 50.0), (exp, np.exp, -20.0, 20.0), (log, np.log, 1e-6, 1e6),
      (tan, np.tan, 0.01, 1.56), (sin, np.sin, 0.0, 3.14), (square, np.square, -50.0, 50.0)],
 )  # fmt: skip
+@settings(max_examples=25)
 @given(ends=st.tuples(st.floats(0, 1), st.floats(0, 1)), share=st.floats(0, 1))
 def test_functions_hold_their_values(function, reference, low, high, ends, share):
     x = interval(low + ends[0] * (high - low), low + ends[1] * (high - low))
@@ -89,13 +85,6 @@ def test_functions_hold_their_values(function, reference, low, high, ends, share
     true = reference(np.longdouble(inside(x, share)))
     found = function(x)
     assert np.longdouble(found.lower) <= true <= np.longdouble(found.upper)
-
-
-def test_sine_and_square_know_their_turning_points():
-    assert float(sin(interval(1.0, 2.0)).upper) == 1.0
-    assert float(sin(interval(1.0, 2.0)).lower) == pytest.approx(np.sin(1.0))
-    assert float(square(interval(-1.0, 2.0)).lower) == 0.0
-    assert float(square(interval(-3.0, 2.0)).upper) == pytest.approx(9.0)
 
 
 def test_a_printed_figure_is_every_number_that_prints_so():
@@ -136,7 +125,7 @@ def points(b: Coefficients, shares) -> list[np.ndarray]:
 span = st.tuples(st.floats(0.0, 1.0), st.floats(0.0, 1.0)).map(sorted)
 
 
-@settings(max_examples=150)
+@settings(max_examples=40)
 @given(span, span, span, span, st.lists(st.floats(0, 1), min_size=4, max_size=4))
 def test_any_point_of_the_box_lies_inside(b, c, d, e, shares):
     ends = [(low + s[0] * (high - low), low + s[1] * (high - low)) for s, (low, high) in zip(
@@ -159,7 +148,7 @@ def test_rounding_of_tables_3_and_4_against_brute_force(table, psi):
     assert found.upper[away] == pytest.approx(corners.max(axis=0)[away], abs=1e-12)
 
 
-@settings(max_examples=100)
+@settings(max_examples=30)
 @given(st.sampled_from([18, 30, 42]), st.lists(st.floats(0, 1), min_size=10, max_size=10))
 def test_no_coefficients_that_print_alike_leave_the_enclosure(psi, shares):
     figures = [printed(PUBLISHED.pressure.estimates[name]) for name in COEFFICIENTS]
@@ -188,14 +177,6 @@ def test_the_enclosure_is_reached_by_corners_and_a_fine_grid(psi):
     picked = [g[np.ix_(*[[0, -1]] * 4)].ravel()[:, None] for g in grid]
     corners = formula(SLIPS, picked[0] / (picked[1] * picked[2]), *picked[1:])
     assert found.holds(corners)
-
-
-def test_more_cells_narrow_the_enclosure_and_stay_inside():
-    b = pressure_box(PUBLISHED, 30)
-    wide, narrow = pull_from_slope(SLIPS, b, cells=40), pull_from_slope(SLIPS, b, cells=1600)
-    assert np.all(wide.lower <= narrow.lower + 1e-12)
-    assert np.all(wide.upper >= narrow.upper - 1e-12)
-    assert np.all((wide.half_width > narrow.half_width)[1:4])
 
 
 def test_a_peak_that_may_be_zero_gives_all_pulls_from_zero():
@@ -246,7 +227,7 @@ def test_simulated_data_stay_within_the_bounds(known, optimal):
     for reference in known:
         other = magic_formula(ASSUMED_SLIPS, **PUBLISHED.geometric[reference.psi].values)
         low, high = (float(b[0]) for b in reference.bounds(other[None], optimal=optimal))
-        errors = rng.standard_normal((4000, ASSUMED_SLIPS.size))
+        errors = rng.standard_normal((1000, ASSUMED_SLIPS.size))
         # Also those that point at the other curve, where the bounds are attained.
         apart = other - reference.curve
         if optimal:
@@ -258,17 +239,6 @@ def test_simulated_data_stay_within_the_bounds(known, optimal):
         assert costs.min() >= low - 1e-12
         assert costs.max() <= high + 1e-12
         assert costs[-2:] == pytest.approx([low, high])
-
-
-def test_the_reconstructed_data_stay_within_the_bounds(known):
-    data = columns("drawbar_pull")
-    for reference in known:
-        rows = data["inflation_pressure_psi"] == reference.psi
-        observed = data["drawbar_pull_kn"][rows]
-        other = magic_formula(ASSUMED_SLIPS, **PUBLISHED.geometric[reference.psi].values)
-        cost = float(np.sum((observed - other) ** 2))
-        low, high = (float(b[0]) for b in reference.bounds(other[None], optimal=True))
-        assert low <= cost <= high
 
 
 def test_pressure_curves_against_the_equations_written_anew():

@@ -16,8 +16,7 @@ from calib.data.quantities import OUTPUTS
 from calib.data.reader import label_of
 from calib.errors import CalibError
 from calib.he2019 import embedded
-from calib.he2019.designs import he2019_tasks
-from calib.he2019.embedded import load_he2019
+from calib.he2019.embedded import he2019_tasks, load_he2019
 from calib.he2019.published import PUBLISHED
 from calib.inference.prior_files import default_priors
 from calib.inference.sampler import SamplerSettings

@@ -166,7 +166,7 @@ def test_measured_plates_prefer_the_law_without_width() -> None:
 
 
 def test_no_shipped_model_is_chosen_for_the_papers_tables_but_its_own() -> None:
-    from calib.he2019.designs import he2019_tasks
+    from calib.he2019.embedded import he2019_tasks
     from calib.report.study import choose_model
 
     for task in he2019_tasks():

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from calib.data.quantities import OUTPUTS
-from calib.he2019.designs import he2019_tasks
+from calib.he2019.embedded import he2019_tasks
 from calib.inference.likelihood import Noise, NoiseChoice
 from calib.inference.mode import find_mode
 from calib.inference.priors import Priors

@@ -13,7 +13,7 @@ from scipy.stats import norm
 import calib.validation.validate as validate_module
 from calib.data import Table, hold_out, table_from_arrays
 from calib.errors import CalibError
-from calib.he2019.designs import he2019_tasks
+from calib.he2019.embedded import he2019_tasks
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import estimate
 from calib.inference.problem import build_problem

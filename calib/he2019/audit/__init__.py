@@ -7,42 +7,42 @@ import io
 import json
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from calib.batch.environment import one_thread
 from calib.batch.pool import HERE
 from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict, finding
-from calib.he2019.audit.pull import (
+from calib.he2019.audit.searches import (
+    CurvatureStudy,
+    GeneticStudy,
+    Seeds,
+    convergence_findings,
+    curvature_signs,
+    study_convergence,
+    study_curvature_signs,
+)
+from calib.he2019.audit.table1 import density_findings
+from calib.he2019.audit.table3 import geometric_findings, sign_of_curvature
+from calib.he2019.audit.table5 import (
     RoundingStudy,
-    bounds,
+    cost_bounds,
     cost_findings,
-    geometric_findings,
     pressure_unit,
     rounding_findings,
-    signs_of_pull,
+    signs_of_quadratic,
     study_rounding,
 )
-from calib.he2019.audit.regressions import (
+from calib.he2019.audit.table6 import (
     InverseStudy,
     QualityStudy,
-    density_findings,
     inverse_findings,
     rut_quality_findings,
     signs_of_rut,
     study_inverse,
     study_quality,
-)
-from calib.he2019.audit.searches import (
-    CurvatureStudy,
-    GeneticStudy,
-    Seeds,
-    begin_convergence,
-    convergence_findings,
-    curvature_signs,
-    study_curvature_signs,
 )
 from calib.he2019.published import DOI, PUBLISHED, Published
 from calib.inference.calibration import Calibration
@@ -50,8 +50,8 @@ from calib.report.numbers import finite
 from calib.report.study import Progress
 
 __all__ = [
-    "Audit", "Basis", "Finding", "Quantity", "Seeds", "Verdict", "audit_csv", "audit_json",
-    "begin_audit", "read_findings", "run_audit",
+    "Audit", "Basis", "Finding", "Quantity", "Seeds", "Verdict", "audit_csv", "audit_document",
+    "audit_json", "run_audit",
 ]  # fmt: skip
 
 
@@ -62,12 +62,12 @@ class Audit:
     findings: tuple[Finding, ...]
     published: Published
     seed: int
+    seeds: Seeds
     rounding: RoundingStudy
     curvature: CurvatureStudy
     quality: QualityStudy
     inverse: InverseStudy
     genetic: GeneticStudy
-    seeds: Seeds
 
     @property
     def counts(self) -> dict[Verdict, int]:
@@ -79,9 +79,11 @@ class Audit:
         return next(f for f in self.findings if f.key == key)
 
 
+@one_thread()
 def run_audit(
     seed: int = 2019, *, published: Published = PUBLISHED, seeds: Seeds | None = None,
     rut_calibration: Calibration | None = None, progress: Progress | None = None,
+    pool: Executor = HERE,
 ) -> Audit:  # fmt: skip
     """Audit the published figures.
 
@@ -97,65 +99,47 @@ def run_audit(
         Of modified_bekker on the reconstructed 18 and 42 psi rows; made here if it is not at hand.
     progress : callable, optional
         Called with what is being done, steps done and steps planned.
+    pool : Executor, optional
+        Where searches run; the numbers do not depend on it.
     """
-    finish = begin_audit(seed, seeds or Seeds(), HERE, published=published)
-    return finish(rut_calibration, progress or (lambda what, done, planned: None))
-
-
-def begin_audit(
-    seed: int, seeds: Seeds, pool: Executor, *, published: Published = PUBLISHED
-) -> Callable[[Calibration | None, Progress], Audit]:
-    """Ask for what takes long, the parameters as for `run_audit`; return what waits for it."""
-    searches = begin_convergence(published, seed, seeds, pool)
+    tell = progress or (lambda what, done, planned: None)
+    seeds = seeds or Seeds()
     signs_asked = pool.submit(study_curvature_signs, published, seed)
-    bounds_asked = pool.submit(bounds, published)
+    bounds_asked = pool.submit(cost_bounds, published)
     rounding_asked = pool.submit(study_rounding, published)
-
-    @one_thread()
-    def finish(rut_calibration: Calibration | None, tell: Progress) -> Audit:
-        inverse = study_inverse(
-            published, seed, calibration=rut_calibration,
-            progress=lambda done, planned: tell("rut depth: sampling", done, planned),
-        )  # fmt: skip
-        searched, quality = searches(tell), study_quality(published)
-        tell("testing printed figures", 0, 2)
-        curvature, at_most = signs_asked.result(), bounds_asked.result()
-        tell("testing printed figures", 1, 2)
-        rounding = rounding_asked.result()
-        findings = [
-            *density_findings(published),
-            *geometric_findings(published, searched.read_off),
-            *signs_of_pull(published),
-            signs_of_rut(published),
-            *curvature_signs(published, curvature),
-            pressure_unit(published),
-            *cost_findings(published, searched.joint.optimum, at_most),
-            *rounding_findings(published, rounding),
-            *convergence_findings(searched),
-            *rut_quality_findings(published, quality),
-            *inverse_findings(published, inverse),
-            finding("test_description", Verdict.UNTESTABLE, setup=published.setup),
-        ]
-        tell("testing printed figures", 2, 2)
-        order = list(Verdict)
-        ranked = tuple(sorted(findings, key=lambda f: order.index(f.verdict)))
-        studies = rounding, curvature, quality, inverse, searched
-        return Audit(ranked, published, seed, *studies, seeds)
-
-    return finish
+    genetic = study_convergence(published, seed, seeds, pool, tell)
+    inverse = study_inverse(
+        published, seed, calibration=rut_calibration,
+        progress=lambda done, planned: tell("rut depth: sampling", done, planned),
+    )  # fmt: skip
+    tell("testing printed figures", 0, 1)
+    curvature, rounding = signs_asked.result(), rounding_asked.result()
+    quality = study_quality(published)
+    tables = (*published.geometric.values(), *published.genetic.values())
+    findings = [
+        *density_findings(published),
+        *geometric_findings(published, genetic.read_off),
+        *map(sign_of_curvature, tables),
+        *(signs_of_quadratic(published, what) for what in ("D", "BCD")),
+        signs_of_rut(published),
+        *curvature_signs(published, curvature),
+        pressure_unit(published),
+        *cost_findings(published, genetic.joint.optimum, bounds_asked.result()),
+        *rounding_findings(published, rounding),
+        *convergence_findings(genetic),
+        *rut_quality_findings(published, quality),
+        *inverse_findings(published, inverse),
+        finding("test_description", Verdict.UNTESTABLE, setup=published.setup),
+    ]
+    tell("testing printed figures", 1, 1)
+    ranked = tuple(sorted(findings, key=lambda f: list(Verdict).index(f.verdict)))
+    return Audit(ranked, published, seed, seeds, rounding, curvature, quality, inverse, genetic)
 
 
-SCHEMA = "calib/audit/1"
-_COLUMNS = (
-    "key", "verdict", "where", "claim", "test", "found", "evidence", "stays_open", "basis",
-    "depends_on_reconstruction",
-)  # fmt: skip
-
-
-def audit_json(audit: Audit) -> str:
-    """Return an audit as JSON; intervals that do not exist are null."""
-    content = {
-        "schema": SCHEMA,
+def audit_document(audit: Audit) -> dict[str, Any]:
+    """Return an audit as plain data; intervals that do not exist are None."""
+    return {
+        "schema": "calib/audit/1",
         "source": f"doi:{DOI}",
         "seed": audit.seed,
         "verdicts": {verdict.value: verdict.meaning for verdict in Verdict},
@@ -168,34 +152,32 @@ def audit_json(audit: Audit) -> str:
             for f in audit.findings
         ],
     }  # fmt: skip
-    return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
 
-def read_findings(content: Mapping[str, Any]) -> tuple[Finding, ...]:
-    """Return the findings in what `audit_json` writes; else a KeyError, TypeError or ValueError."""
-    return tuple(_read(entry) for entry in content["findings"])
+def audit_json(audit: Audit) -> str:
+    """Return `audit_document` as JSON."""
+    return json.dumps(audit_document(audit), indent=1, allow_nan=False) + "\n"
 
 
-def _read(entry: Mapping[str, Any]) -> Finding:
-    known = {f.name: entry[f.name] for f in fields(Finding)}
-    known["figures"] = tuple(known["figures"])
-    found: list[dict[str, Any]] = [
-        {key: math.nan if value is None else value for key, value in q.items()}
-        for q in known["found"]
-    ]
-    known["found"] = tuple(Quantity(**q) for q in found)
-    known["verdict"], known["basis"] = Verdict(known["verdict"]), Basis(known["basis"])
-    return Finding(**known)
+def audit_csv(content: Mapping[str, Any]) -> str:
+    """Return the findings of an `audit_document` as CSV, one row for each.
 
-
-def audit_csv(findings: Iterable[Finding]) -> str:
-    """Return findings as CSV, one row for each."""
+    KeyError, TypeError or ValueError if it is something else.
+    """
+    columns = (
+        "key", "verdict", "where", "claim", "test", "found", "evidence", "stays_open", "basis",
+        "depends_on_reconstruction",
+    )  # fmt: skip
     out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(_COLUMNS)
-    for f in findings:
-        writer.writerow([
-            f.key, f.verdict.value, f.where, f.claim, f.test, "; ".join(map(str, f.found)),
-            f.evidence, f.stays_open, f.basis.value, "yes" if f.reconstructed else "no",
-        ])  # fmt: skip
+    writer = csv.DictWriter(out, columns, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    for entry in content["findings"]:
+        found: list[dict[str, Any]] = [
+            {key: math.nan if v is None else v for key, v in q.items()} for q in entry["found"]
+        ]
+        writer.writerow({
+            **{name: entry[name] for name in columns},
+            "found": "; ".join(str(Quantity(**q)) for q in found),
+            "depends_on_reconstruction": "yes" if entry["depends_on_reconstruction"] else "no",
+        })  # fmt: skip
     return out.getvalue()

@@ -45,9 +45,6 @@ from calib.models.base import Array
 from calib.models.magic_formula import magic_formula, sine_of
 from calib.report.reference import Figure, FittedTable
 
-# NumPy's vectorised functions are within 4 units in the last place.
-_ULPS = 8.0
-
 
 @dataclass(frozen=True, eq=False)
 class Interval:
@@ -105,7 +102,8 @@ def _outward(lower: ArrayLike, upper: ArrayLike) -> Interval:
 def _step(end: ArrayLike, towards: float) -> Array:
     x = np.asarray(end, dtype=np.float64)
     finite = np.isfinite(x)
-    steps = np.copysign(_ULPS, towards) * np.spacing(np.where(finite, np.abs(x), 0.0))
+    # NumPy's vectorised functions are within 4 units in the last place.
+    steps = np.copysign(8.0, towards) * np.spacing(np.where(finite, np.abs(x), 0.0))
     return np.asarray(np.where(finite, x + steps, np.nextafter(x, towards)))
 
 
@@ -166,10 +164,13 @@ def sin(x: Interval) -> Interval:
     return Interval(out.lower, np.minimum(out.upper, 1.0))
 
 
+def root_of_rest(r_squared: Interval) -> Interval:
+    """Return sqrt(1 - R^2)."""
+    low, high = (np.asarray(np.sqrt(1.0 - end)) for end in (r_squared.upper, r_squared.lower))
+    return Interval(low, high)
+
+
 # Boxes of the Magic Formula's coefficients
-
-
-_C_CELLS = 2
 
 
 class Coefficients(NamedTuple):
@@ -230,12 +231,13 @@ def pull_from_slope(slip_percent: Array, box: Coefficients, *, cells: int = 400)
         raise ValueError("the slope must be positive")
     holds_zero = bool(box.D.lower <= 0.0 <= box.D.upper)
     ends = sorted(abs(float(end)) for end in (box.D.lower, box.D.upper))
+    C_cells = 2
     D_edges = np.linspace(0.0 if holds_zero else ends[0], ends[1], cells + 1)
-    C_edges = np.linspace(float(box.C.lower), float(box.C.upper), _C_CELLS + 1)
+    C_edges = np.linspace(float(box.C.lower), float(box.C.upper), C_cells + 1)
     x = np.asarray(slip_percent, dtype=np.float64)[:, None, None]
     D = Interval(D_edges[None, :-1, None], D_edges[None, 1:, None])
     C = Interval(C_edges[None, None, :-1], C_edges[None, None, 1:])
-    shape = (x.size, cells, _C_CELLS)
+    shape = (x.size, cells, C_cells)
     rise, product = box.stiffness * exact(x), C * D
     with np.errstate(divide="ignore", invalid="ignore"):
         low = np.broadcast_to(rise.lower / product.upper, shape)

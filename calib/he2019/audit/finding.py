@@ -94,13 +94,9 @@ class Quantity:
 
 
 def rounded(
-    name: str,
-    interval: Interval,
-    unit: str = "1",
-    published: Figure | None = None,
-    *,
+    name: str, interval: Interval, unit: str = "1", published: Figure | None = None, *,
     middle: bool = True,
-) -> Quantity:
+) -> Quantity:  # fmt: skip
     """Return what the printed digits allow, least to largest; `middle` is shown if asked."""
     low, high = float(interval.lower.min()), float(interval.upper.max())
     value = 0.5 * (low + high) if middle else math.nan
@@ -137,6 +133,11 @@ class Finding:
     def reconstructed(self) -> bool:
         """Whether the verdict depends on the reconstruction."""
         return self.basis is Basis.RECONSTRUCTED
+
+
+def consistent_if(possible: bool) -> Verdict:
+    """Return what it says of a figure that it passes, or fails, a test that it could fail."""
+    return Verdict.CONSISTENT if possible else Verdict.CONTRADICTED
 
 
 def beside_rival(read: bool, rival: bool) -> Verdict:

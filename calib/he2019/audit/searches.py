@@ -9,9 +9,9 @@ of each pressure and needs the slips, so it is repeated with other shifts of zer
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -28,7 +28,7 @@ from calib.he2019.audit.bounds import (
     references,
 )
 from calib.he2019.audit.finding import Finding, Quantity, Verdict, finding
-from calib.he2019.audit.pull import READINGS, Signs, printed_signs, signs_text
+from calib.he2019.audit.table5 import READINGS, Signs, printed_signs, signs_text
 from calib.he2019.embedded import load_he2019
 from calib.he2019.published import Published
 from calib.he2019.reconstruction import SLIP_SHIFT
@@ -39,11 +39,6 @@ from calib.inference.search import hold_unidentified, search_space
 from calib.models.base import Array
 from calib.report.study import Progress
 from calib.validation.scores import jeffreys
-
-_BOX = 30.0
-_C_RANGE = (1.0, 2.0)
-# A search has arrived if its cost exceeds the optimum by less than this part of it.
-_ARRIVED = 0.01
 
 
 @dataclass(frozen=True)
@@ -67,7 +62,7 @@ class Search:
     @property
     def arrived(self) -> int:
         """Seeds whose cost is within 1 % of the optimum."""
-        return int(np.sum(self.costs <= self.optimum * (1.0 + _ARRIVED)))
+        return int(np.sum(self.costs <= 1.01 * self.optimum))
 
     @property
     def share(self) -> Quantity:
@@ -81,11 +76,10 @@ class Search:
 class GeneticStudy:
     """All searches with Table 2's settings, and the geometric method on the same data; by psi."""
 
-    settings: GeneticSettings
     by_pressure: Mapping[int, Search]
     joint: Search
     printed_coordinates: Search
-    read_off: Mapping[int, PointEstimate] = field(default_factory=dict)
+    read_off: Mapping[int, PointEstimate]
 
     @property
     def searches(self) -> tuple[Search, ...]:
@@ -102,12 +96,11 @@ def printed_settings(published: Published) -> GeneticSettings:
     )  # fmt: skip
 
 
-def begin_convergence(
-    published: Published, seed: int, seeds: Seeds, pool: Executor
-) -> Callable[[Progress], GeneticStudy]:
-    """Ask for the searches over seeds, on the reconstructed data; return what waits for them."""
-    settings = printed_settings(published)
-    box = _printed_box(published)
+def study_convergence(
+    published: Published, seed: int, seeds: Seeds, pool: Executor, tell: Progress
+) -> GeneticStudy:
+    """Repeat the searches over seeds, on the reconstructed data."""
+    settings, box = printed_settings(published), _printed_box(published)
     # These take longest: two halves, side by side.
     n = seeds.printed_coordinates
     halves = [range(n // 2), range(n // 2, n)] if n > 1 else [range(n)]
@@ -120,26 +113,21 @@ def begin_convergence(
         for psi, table in published.genetic.items()
     }  # fmt: skip
     planned = seeds.by_pressure * len(by_pressure) + seeds.joint + n
-
-    def finish(tell: Progress) -> GeneticStudy:
-        what = "genetic algorithm over seeds"
-        alone = {}
-        for i, (psi, piece) in enumerate(by_pressure.items(), start=1):
-            alone[psi] = piece.result()
-            tell(what, i * seeds.by_pressure, planned)
-        together = joint.result()
-        tell(what, planned - n, planned)
-        costs = np.concatenate([piece.result() for piece in printed])
-        tell(what, planned, planned)
-        table = load_he2019("drawbar_pull")
-        read_off = {
-            psi: estimate(_alone(table, psi), "geometric", generator(seed, "audit", "geometric"))
-            for psi in published.genetic
-        }
-        in_printed = Search("all pressures, c1 to b0", together.optimum, costs, joint_text)
-        return GeneticStudy(settings, alone, together, in_printed, read_off)
-
-    return finish
+    what, alone = "genetic algorithm over seeds", {}
+    for i, (psi, asked) in enumerate(by_pressure.items(), start=1):
+        alone[psi] = asked.result()
+        tell(what, i * seeds.by_pressure, planned)
+    together = joint.result()
+    tell(what, planned - n, planned)
+    costs = np.concatenate([asked.result() for asked in printed])
+    tell(what, planned, planned)
+    table = load_he2019("drawbar_pull")
+    read_off = {
+        psi: estimate(_alone(table, psi), "geometric", generator(seed, "audit", "geometric"))
+        for psi in published.genetic
+    }
+    in_printed = Search("all pressures, c1 to b0", together.optimum, costs, joint_text)
+    return GeneticStudy(alone, together, in_printed, read_off)
 
 
 def _alone(table: Table, psi: int) -> Problem:
@@ -171,8 +159,8 @@ def _printed_box(published: Published) -> tuple[Array, Array]:
     """Return the box of c1 to c9 and b0 that is searched, shapes (10,)."""
     printed = printed_coefficients(published)
     printed[8] = abs(printed[8])  # c9 is positive at the optimum, and by the audit in Table 5 too
-    lower, upper = np.minimum(0.0, _BOX * printed), np.maximum(0.0, _BOX * printed)
-    lower[9], upper[9] = _C_RANGE
+    lower, upper = np.minimum(0.0, 30.0 * printed), np.maximum(0.0, 30.0 * printed)
+    lower[9], upper[9] = 1.0, 2.0
     return lower, upper
 
 
@@ -220,9 +208,6 @@ def convergence_findings(study: GeneticStudy) -> list[Finding]:
 
 # The signs of c7, c8 and c9
 
-_SHIFTS = (0.0, 1.0, 3.0, 4.0)
-_SCREENED, _STARTS, _STEP, _WORST = 400, 4, 1e-5, 1e4
-
 
 def least_cost(
     published: Published, signs: Signs, slips: Array, seed: int, *, optimal: bool = True
@@ -239,15 +224,16 @@ def least_cost(
 
     def bound(z: Array) -> Array:
         least, _ = joint_bounds(middle + half * z, known, slips, optimal=optimal)
-        return np.minimum(least, _WORST)
+        return np.minimum(least, 1e4)  # finite where the formula is not defined
 
     def with_gradient(z: Array) -> tuple[float, Array]:
         # One batch: the point and a step to either side of it along each coordinate.
-        values = bound(np.vstack([z, z + _STEP * np.eye(z.size), z - _STEP * np.eye(z.size)]))
-        return float(values[0]), (values[1 : 1 + z.size] - values[1 + z.size :]) / (2.0 * _STEP)
+        steps = 1e-5 * np.eye(z.size)
+        here, up, down = np.split(bound(np.vstack([z, z + steps, z - steps])), [1, 1 + z.size])
+        return float(here[0]), (up - down) / 2e-5
 
-    drawn = generator(seed, "audit", "curvature", *signs).uniform(-1.0, 1.0, (_SCREENED, half.size))
-    starts = drawn[np.argsort(bound(drawn))[:_STARTS]]
+    drawn = generator(seed, "audit", "curvature", *signs).uniform(-1.0, 1.0, (400, half.size))
+    starts = drawn[np.argsort(bound(drawn))[:4]]
     ends = [
         minimize(with_gradient, z, jac=True, method="L-BFGS-B", bounds=[(-1.0, 1.0)] * z.size)
         for z in starts
@@ -281,58 +267,49 @@ def study_curvature_signs(published: Published, seed: int) -> CurvatureStudy:
         for optimal in (True, False)
     )
     nominal = ASSUMED_SLIPS - 100.0 * SLIP_SHIFT
-    best = sorted(least, key=lambda s: least[s])[:2]
     shifted = {
-        s: tuple(least_cost(published, s, nominal + shift, seed) for shift in _SHIFTS) for s in best
+        s: tuple(least_cost(published, s, nominal + shift, seed) for shift in (0.0, 1.0, 3.0, 4.0))
+        for s in sorted(least, key=lambda s: least[s])[:2]
     }
     return CurvatureStudy(published.pressure.quality["cost"].value, least, free, shifted)
 
 
 def curvature_signs(published: Published, study: CurvatureStudy) -> list[Finding]:
     """Judge c7 and c8 together, and c9 by itself."""
-    read = printed_signs(published, "E")
+    read, printed = printed_signs(published, "E"), study.published_cost
     best, second = study.order[:2]
-    return [_first_two(study, read, best), _last(published, study, read, best, second)]
-
-
-def _quantities(study: CurvatureStudy, readings: list[Signs]) -> Iterator[Quantity]:
-    for s in readings:
-        name, least = f"least cost with {signs_text(s)}", study.least[s]
-        if s in study.by_shift:
-            shifts = (*study.by_shift[s], least)
-            what = "shifts of zero slip from 0 to 4 %"
-            yield Quantity(name, least, "kN^2", min(shifts), max(shifts), what)
-        else:
-            yield Quantity(name, least, "kN^2")
-
-
-def _first_two(study: CurvatureStudy, read: Signs, best: Signs) -> Finding:
     nearest = {
         (a, b): min(study.least[a, b, c] for c in (1, -1)) for a, b in product((1, -1), repeat=2)
     }
     own, rival = nearest.pop(best[:2]), min(nearest.values())
-    excluded = [s for s, cost in study.least_free.items() if cost > study.published_cost]
     verdict = Verdict.CORRECTED
     if best[:2] == read[:2]:
-        verdict = Verdict.CONFIRMED if rival > study.published_cost else Verdict.CONSISTENT
-    return finding(
+        verdict = Verdict.CONFIRMED if rival > printed else Verdict.CONSISTENT
+    first_two = finding(
         "table5_signs_of_c7_c8", verdict, _quantities(study, study.order[:4]),
         read=signs_text(read[:2]), best=signs_text(best[:2]), own=own, rival=rival,
-        printed=study.published_cost, excluded=len(excluded),
+        printed=printed, excluded=sum(cost > printed for cost in study.least_free.values()),
     )  # fmt: skip
-
-
-def _last(
-    published: Published, study: CurvatureStudy, read: Signs, best: Signs, second: Signs
-) -> Finding:
     always = best[:2] == second[:2] and all(
         a < b for a, b in zip(study.by_shift[best], study.by_shift[second], strict=True)
     )
     verdict = Verdict.UNTESTABLE
     if always:
         verdict = Verdict.CONFIRMED if best[2] == read[2] else Verdict.CORRECTED
-    return finding(
+    last = finding(
         "table5_sign_of_c9", verdict, _quantities(study, [best, second]),
         c9=published.pressure.estimates["c9"], sign="positive" if best[2] > 0 else "negative",
-        least=study.least[best], rival=study.least[second], printed=study.published_cost,
+        least=study.least[best], rival=study.least[second], printed=printed,
     )  # fmt: skip
+    return [first_two, last]
+
+
+def _quantities(study: CurvatureStudy, readings: list[Signs]) -> Iterator[Quantity]:
+    for s in readings:
+        name, least = f"least cost with {signs_text(s)}", study.least[s]
+        shifts = (*study.by_shift.get(s, ()), least)
+        if len(shifts) == 1:
+            yield Quantity(name, least, "kN^2")
+        else:
+            what = "shifts of zero slip from 0 to 4 %"
+            yield Quantity(name, least, "kN^2", min(shifts), max(shifts), what)

@@ -1,7 +1,4 @@
-"""Tables 1 and 6: signs, units and goodness of fit of the two regressions.
-
-Eq 1, density = {(CI/C1) [C2 + (theta - C3)^2]}^(1/C4), has every coefficient once, so its extremes
-over all that print alike are those of interval arithmetic.
+"""Table 6, rut depth: signs, goodness of fit, and what regressing the set pressure does.
 
 Eq 22 regresses ln pgr, which takes two values d apart, on ln zt and s ln zt. With n points, a part
 w of them at the higher pressure and p = 3 coefficients,
@@ -29,13 +26,13 @@ import numpy as np
 import scipy
 
 from calib.data import Table, hold_out
-from calib.he2019.audit.bounds import Interval, exact, exp, log, printed, square
+from calib.he2019.audit.bounds import Interval, exact, exp, log, printed, root_of_rest
 from calib.he2019.audit.finding import (
     Finding,
     Quantity,
     Verdict,
-    beside_rival,
     between,
+    consistent_if,
     finding,
     percent,
     rounded,
@@ -51,147 +48,22 @@ from calib.inference.sampler import Progress
 from calib.models.base import Array
 from calib.models.soil import rut_depth
 
-# Cone indices of soils that carry a wheel but let it sink, kPa.
-_CONE_INDEX = Interval(np.array(100.0), np.array(3000.0))
-# Dry bulk density of mineral soils, g/cm^3: 1.0 to 1.9 (Brady & Weil 2016, The Nature and
-# Properties of Soils), with a tenth to either side.
-_MINERAL = (0.9, 2.0)
 
-
-def density_range(
-    published: Published, *, exponent: int = 1, C3_sign: int = 1, cone_index: Interval = _CONE_INDEX
-) -> Interval:
-    """Return the densities (g/cm^3) that Table 1 gives over the tested water contents.
-
-    1 takes the exponent of C1, or C3, with the sign that it is read with, -1 with the other; cone
-    index is in the unit of Eq 1.
-    """
-    figures = published.bulk_density.estimates
-    C1, C2, C3, C4 = (printed(figures[name]) for name in ("C1", "C2", "C3", "C4"))
-    if exponent < 0:
-        mantissa = exact(10.0 ** np.floor(np.log10(figures["C1"].value)))
-        C1 = C1 / mantissa / mantissa
-    if C3_sign < 0:
-        C3 = -C3
-    largest = published.setup.largest_water_content
-    water = Interval(np.array(0.0), np.array(largest.value + largest.half_unit))
-    return exp((log(cone_index) - log(C1) + log(C2 + square(water - C3))) / C4)
-
-
-def density_findings(published: Published) -> list[Finding]:
-    """Judge Table 1."""
-    return [
-        _exponent(published), _sign_of_C3(published), _unit(published), _quality(published),
-        finding("table1_values", Verdict.UNTESTABLE),
-    ]  # fmt: skip
-
-
-def _plausible(density: Interval) -> bool:
-    low, high = _MINERAL
-    return bool(density.lower >= low and density.upper <= high)
-
-
-def _density(name: str, density: Interval) -> Quantity:
-    ends = float(density.lower), float(density.upper)
-    return between(name, *ends, "g/cm^3", "over conditions and rounding")
-
-
-def _exponent(published: Published) -> Finding:
-    figure = published.bulk_density.estimates["C1"]
-    read, other = density_range(published), density_range(published, exponent=-1)
-    verdict = beside_rival(_plausible(read), _plausible(other))
-    wrong = other if verdict is Verdict.CONFIRMED else read
-    power = int(np.floor(np.log10(figure.value)))
-    return finding(
-        "table1_exponent_of_C1", verdict,
-        (_density(f"density with an exponent of {power:+d}", read),
-         _density(f"density with an exponent of {-power:+d}", other)),
-        C1=figure, mineral=_MINERAL, power=-power if wrong is other else power, wrong=wrong,
-        read=read, most=_most_samples(published, float(wrong.upper)),
-    )  # fmt: skip
-
-
-def _most_samples(published: Published, densest: float) -> int | str:
-    """Return how many samples could have both the RMSE and the largest relative error printed.
-
-    Some error is at least sqrt(SSE/n) = RMSE sqrt((n - p)/n), and none exceeds the largest
-    relative error of the densest sample.
-    """
-    table = published.bulk_density
-    rmse, relative = table.quality["rmse"], table.quality["max_relative_error"]
-    part = relative.value + relative.half_unit
-    largest = part * densest / (1.0 - part)
-    share = (largest / (rmse.value - rmse.half_unit)) ** 2
-    return "any number of" if share >= 1.0 else int(len(table.estimates) / (1.0 - share))
-
-
-def _sign_of_C3(published: Published) -> Finding:
-    rmse = published.bulk_density.quality["rmse"].value
-    one = exact(400.0)
-    read = density_range(published, cone_index=one)
-    other = density_range(published, C3_sign=-1, cone_index=one)
-    apart = float(max(other.upper - read.lower, read.upper - other.lower))
-    return finding(
-        "table1_sign_of_C3",
-        Verdict.UNTESTABLE if apart <= 2.0 * rmse else Verdict.CONSISTENT,
-        (_density("density with C3 positive", read), _density("density with C3 negative", other),
-         Quantity("largest difference", apart, "g/cm^3", published=f"RMSE {rmse:g}")),
-        C3=published.bulk_density.estimates["C3"], apart=apart, rmse=rmse,
-    )  # fmt: skip
-
-
-def _unit(published: Published) -> Finding:
-    mpa = Interval(_CONE_INDEX.lower / 1000.0, _CONE_INDEX.upper / 1000.0)
-    in_kpa, in_mpa = density_range(published), density_range(published, cone_index=mpa)
-    verdict = beside_rival(_plausible(in_kpa), _plausible(in_mpa))
-    # That only kPa gives a soil does not prove it; that both do decides nothing.
-    weaker = {Verdict.CONFIRMED: Verdict.CONSISTENT, Verdict.CONSISTENT: Verdict.UNTESTABLE}
-    return finding(
-        "table1_unit_of_cone_index", weaker.get(verdict, verdict),
-        (_density("density with kPa", in_kpa), _density("density with MPa", in_mpa)),
-        in_kpa=in_kpa, in_mpa=in_mpa,
-    )  # fmt: skip
-
-
-def _quality(published: Published) -> Finding:
-    table = published.bulk_density
-    r_squared, rmse, relative = (
-        printed(table.quality[name]) for name in ("r_squared", "rmse", "max_relative_error")
-    )
-    density = density_range(published)
-    # One error squared is no more than all of them: (relative x density)^2 <= RMSE^2 (n - p).
-    largest = relative * density
-    fewest = len(table.estimates) + float(np.ceil((largest.lower / rmse.upper) ** 2))
-    most = _most_samples(published, float(density.upper))
-    # The sd of the observed densities, and the factor of cone index that the explained part needs.
-    spread = rmse / _root_of_rest(r_squared)
-    explained = np.sqrt(r_squared.upper) * spread.upper / density.lower
-    factor = float(np.exp(table.values["C4"] * explained))
-    possible = isinstance(most, str) or most >= fewest
-    return finding(
-        "table1_quality",
-        Verdict.CONSISTENT if possible and factor < 30.0 else Verdict.CONTRADICTED,
-        (Quantity("samples at least", fewest),
-         rounded("sd of the measured densities", spread, "g/cm^3"),
-         Quantity("factor of cone index per sd of the fitted densities, at most", factor)),
-        quality=table.quality, fewest=int(fewest), factor=factor,
-        spread=float(spread.middle / density.middle),
-    )  # fmt: skip
-
-
-def _root_of_rest(r_squared: Interval) -> Interval:
-    low, high = (np.asarray(np.sqrt(1.0 - end)) for end in (r_squared.upper, r_squared.lower))
-    return Interval(low, high)
+def ground_pressure(published: Published) -> Interval:
+    """Return load over contact rectangle (kPa) at each inflation pressure, shape (3,)."""
+    setup = published.setup
+    lengths = [printed(f) for f in setup.contact_length_mm.values()]
+    ends = (np.array([float(getattr(i, end)) for i in lengths]) for end in ("lower", "upper"))
+    # The load is a setting: its one printed digit is not an uncertainty of the test.
+    load = exact(1e6 * setup.normal_load_kn.value)
+    return load / (Interval(*ends) * printed(setup.contact_width_mm))
 
 
 def signs_of_rut(published: Published) -> Finding:
     """Test the signs of n0, n1 and of the exponent of k (Eq 21)."""
     figures, setup = published.rut_depth.estimates, published.setup
     n0, n1, k = (printed(figures[name]) for name in ("n0", "n1", "k"))
-    lengths = [printed(f) for f in setup.contact_length_mm.values()]
-    ends = (np.array([float(getattr(i, end)) for i in lengths]) for end in ("lower", "upper"))
-    area = Interval(*ends) * printed(setup.contact_width_mm)
-    pressure = exact(1e6 * setup.normal_load_kn.value) / area
+    pressure = ground_pressure(published)
     # In metres, at each pressure.
     exponents = n0, n0 + n1 * printed(setup.largest_rut_slip)
     towed, driven = (exp((log(pressure) - log(k)) / n) for n in exponents)
@@ -209,27 +81,20 @@ def signs_of_rut(published: Published) -> Finding:
 
 # The goodness of fit of Table 6
 
-_N_MAX = 160
-_HELD_OUT_LEAST = 0.025
-
 
 @dataclass(frozen=True, eq=False)
 class QualityStudy:
     """ln(pgr42/pgr18) by the number of points n (m,), and from the contact lengths.
 
-    `implied` (m,) follows from R^2 and RMSE, pressures equally often; the assumed n are two
-    pressures at the nine nominal slips up to 20 %.
+    `implied` (m,) follows from R^2 and RMSE, pressures equally often; `reconciled` are the n for
+    which both agree, the assumed n two pressures at the nine nominal slips up to 20 %.
     """
 
     n: Array
     implied: Interval
     from_contact: Interval
-    assumed_n: int
-
-    @property
-    def reconciled(self) -> Array:
-        """Numbers of points for which both agree."""
-        return np.asarray(self.n[_meet(self.implied, self.from_contact)])
+    reconciled: Array
+    assumed_n: int = 2 * len(SLIPS)
 
 
 def _meet(a: Interval, b: Interval) -> Array:
@@ -247,14 +112,15 @@ def log_pressure_ratio(published: Published, n: Array, share: float = 0.5) -> In
     """Return ln(pgr42/pgr18) by R^2 and RMSE of n points, a `share` of them at one pressure."""
     quality = published.rut_depth.quality
     factor = np.sqrt((n - len(published.rut_depth.estimates)) / (n * share * (1.0 - share)))
-    return printed(quality["rmse"]) / _root_of_rest(printed(quality["r_squared"])) * exact(factor)
+    return printed(quality["rmse"]) / root_of_rest(printed(quality["r_squared"])) * exact(factor)
 
 
 def study_quality(published: Published) -> QualityStudy:
     """Compare the two ways to ln(pgr42/pgr18)."""
     low, high = fitted_lengths(published)
-    n = np.arange(len(published.rut_depth.estimates) + 1.0, _N_MAX + 1.0)
-    return QualityStudy(n, log_pressure_ratio(published, n), log(low / high), 2 * len(SLIPS))
+    n = np.arange(len(published.rut_depth.estimates) + 1.0, 161.0)
+    implied, from_contact = log_pressure_ratio(published, n), log(low / high)
+    return QualityStudy(n, implied, from_contact, n[_meet(implied, from_contact)])
 
 
 def rut_quality_findings(published: Published, study: QualityStudy) -> list[Finding]:
@@ -284,7 +150,7 @@ def _consistency(published: Published, study: QualityStudy) -> Finding:
         if _meet(log_pressure_ratio(published, np.array(total), m / total), study.from_contact)
     ]
     return finding(
-        "table6_consistency", Verdict.CONSISTENT if agree else Verdict.CONTRADICTED, found,
+        "table6_consistency", consistent_if(agree), found,
         quality=published.rut_depth.quality, n=n, implied=implied, ends=ends, splits=splits,
         readings=[] if agree else [float(m) for m in reconciled if m % n == 0 and m > n],
         contact=float(study.from_contact.middle),
@@ -317,7 +183,7 @@ def _fitted_errors(published: Published, study: QualityStudy) -> Finding:
     above = int(sse // (np.log1p(below) * flattest) ** 2)
     fine = least <= stated.value + stated.half_unit and stated.value - stated.half_unit <= most
     return finding(
-        "table6_fitted_errors", Verdict.CONSISTENT if fine else Verdict.CONTRADICTED,
+        "table6_fitted_errors", consistent_if(fine),
         (between("largest relative error", least, most, "1", "bounds", stated.text),
          Quantity(f"errors above {percent(below, 2)}, at most", float(above))),
         stated=stated.value, below=below, rmse=rmse, n=n, least=least, most=most, above=above,
@@ -334,9 +200,9 @@ def _held_out_errors(published: Published, study: QualityStudy) -> Finding:
     beyond = 2.0 * float(scipy.stats.norm.sf(np.log1p(threshold) / sd))
     at_most = float(scipy.stats.binom.cdf(few, levels, beyond))
     all_within = float((1.0 - 2.0 * scipy.stats.norm.sf(np.log1p(largest) / sd)) ** levels)
-    fine = min(at_most, all_within) > _HELD_OUT_LEAST
+    fine = min(at_most, all_within) > 0.025
     return finding(
-        "table6_held_out_errors", Verdict.CONSISTENT if fine else Verdict.CONTRADICTED,
+        "table6_held_out_errors", consistent_if(fine),
         (Quantity("sd of ln zt within a pressure", sd),
          Quantity(f"probability of {few} or fewer above {percent(threshold, 2)}", at_most),
          Quantity(f"probability that none exceeds {percent(largest, 2)}", all_within)),
@@ -346,26 +212,18 @@ def _held_out_errors(published: Published, study: QualityStudy) -> Finding:
 
 
 def _ground_pressure(published: Published) -> Finding:
-    setup = published.setup
-    # The load is a setting: its one printed digit is not an uncertainty of the test.
-    load, width = exact(setup.normal_load_kn.value), printed(setup.contact_width_mm)
+    p = ground_pressure(published)
     found = [
-        rounded(f"load over contact rectangle at {psi} psi",
-                exact(1e6) * load / (width * printed(length)), "kPa")
-        for psi, length in setup.contact_length_mm.items()
-    ]  # fmt: skip
-    pairs = zip(found, setup.contact_length_mm, strict=True)
-    shares = [q.value / (6.894757 * psi) for q, psi in pairs]
+        rounded(f"load over contact rectangle at {psi} psi", Interval(low, high), "kPa")
+        for psi, low, high in zip(published.genetic, p.lower, p.upper, strict=True)
+    ]
+    shares = [q.value / (6.894757 * psi) for q, psi in zip(found, published.genetic, strict=True)]
     return finding("ground_pressure", Verdict.UNTESTABLE, found, shares=shares)
 
 
 # What Eq 22 does to n0, n1 and k
 
-_N_CAMPAIGNS = 4000
-_MM = 1000.0
 _UNITS = {"n0": "1", "n1": "1", "k": "kPa/m^n"}
-# An exponent off by less than this part would not be worth a correction.
-_WORTH = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -390,7 +248,7 @@ class InverseStudy:
 
 
 def simulate_inverse(
-    problem: Problem, truth: PointEstimate, rng: np.random.Generator, size: int = _N_CAMPAIGNS
+    problem: Problem, truth: PointEstimate, rng: np.random.Generator, size: int = 4000
 ) -> Array:
     """Fit Eq 22 to campaigns simulated from Eq 21, shape (size, 3): n0, n1 and R^2.
 
@@ -429,8 +287,8 @@ def study_inverse(
     each = (reported[name][:, None] for name in ("k", "n0", "n1"))
     return InverseStudy(
         calibration, direct, held, reported["n0"], reported["n1"], reported["k"],
-        _MM * rut_depth(pressure, slip, v["k"], v["n0"], v["n1"]),
-        _MM * rut_depth(pressure, slip, *each),
+        1000.0 * rut_depth(pressure, slip, v["k"], v["n0"], v["n1"]),
+        1000.0 * rut_depth(pressure, slip, *each),
         simulate_inverse(problem, direct, generator(seed, "audit", "inverse")),
     )  # fmt: skip
 
@@ -449,25 +307,21 @@ def inverse_findings(published: Published, study: InverseStudy) -> list[Finding]
 
 
 def _worth_correcting(published: Published) -> bool:
-    return float(attenuation(published).middle) - 1.0 > _WORTH
-
-
-def _corrected_k(published: Published) -> Interval:
-    """Return k by the means of the ruts: ln k follows from the exponents and the mean of ln pgr."""
-    width = printed(published.setup.contact_width_mm)
-    load = exact(1e6 * published.setup.normal_load_kn.value)
-    one, other = (log(load / (width * length)) for length in fitted_lengths(published))
-    middle = exact(0.5) * (one + other)
-    k = printed(published.rut_depth.estimates["k"])
-    return exp(middle - (middle - log(k)) * attenuation(published))
+    # An exponent off by less would not be worth a correction.
+    return float(attenuation(published).middle) - 1.0 > 0.05
 
 
 def inverse_by_print(published: Published) -> Finding:
     """Correct n0, n1 and k by the printed R^2 alone."""
     figures, factor = published.rut_depth.estimates, attenuation(published)
-    n0, n1 = printed(figures["n0"]), printed(figures["n1"])
-    corrected = {"n0": n0 * factor, "n1": n1 * factor, "k": _corrected_k(published)}
+    n0, n1, k = (printed(figures[name]) for name in ("n0", "n1", "k"))
     low, high = fitted_lengths(published)
+    # ln k follows from the exponents and the mean of ln pgr.
+    ln_p = log(ground_pressure(published))
+    ends = (0.5 * (end[0] + end[-1]) for end in (ln_p.lower, ln_p.upper))
+    middle = Interval(*ends)
+    by_k = exp(middle - (middle - log(k)) * factor)
+    corrected = {"n0": n0 * factor, "n1": n1 * factor, "k": by_k}
     ratio, exponent = log(low / high), n0 + n1 * exact(float(np.mean(SLIPS)))
     by_table, by_means = exp(ratio / exponent), exp(ratio / (exponent * factor))
     deeper, claimed = (float(r.middle) - 1.0 for r in (by_means, by_table))
@@ -506,10 +360,11 @@ def inverse_by_likelihood(published: Published, study: InverseStudy) -> Finding:
                  "95 % of campaigns", figure.text)
         for j, (name, figure) in enumerate(beside.items())
     ]  # fmt: skip
-    missed = not low[0] <= direct["n0"] <= high[0]
-    verdict = Verdict.CORRECTED if missed else Verdict.CONSISTENT
+    missed, verdict = not low[0] <= direct["n0"] <= high[0], Verdict.UNTESTABLE
+    if study.calibration.converged:
+        verdict = Verdict.CORRECTED if missed else Verdict.CONSISTENT
     return finding(
-        "table6_likelihood", verdict if study.calibration.converged else Verdict.UNTESTABLE, found,
+        "table6_likelihood", verdict, found,
         campaigns=study.simulated.shape[0], direct=direct["n0"], low=low[0], middle=middle[0],
         high=high[0], missed=missed, n0=summary["n0"], printed=figures["n0"],
         below=float(np.mean(study.n0 < figures["n0"].value)),
