@@ -132,21 +132,15 @@ def write_table(
     CalibError
         If the columns differ in length or the file cannot be written.
     """
-    cells = {name: _format(values) for name, values in columns.items()}
-    lengths = {name: len(column) for name, column in cells.items()}
-    if len(set(lengths.values())) > 1:
-        raise CalibError(
-            f"the columns differ in length: {lengths}", where=os.fspath(path),
-            expected="columns of one length", hint="pass arrays of shape (n,)",
-        )  # fmt: skip
+    try:
+        text = table_csv(columns)
+    except CalibError as error:
+        raise error.within(os.fspath(path)) from None
     target = Path(path)
     # In the folder of the target, so that the final step only renames.
     scratch = target.with_name(f".{target.name}.{os.getpid()}.tmp")
     try:
-        with scratch.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(cells)
-            writer.writerows(zip(*cells.values(), strict=True))
+        scratch.write_text(text, encoding="utf-8", newline="")
         scratch.replace(target)
     except OSError as error:
         raise CalibError(
@@ -157,6 +151,23 @@ def write_table(
     finally:
         with suppress(OSError):
             scratch.unlink(missing_ok=True)
+
+
+def table_csv(columns: Mapping[str, ArrayLike | Sequence[str]]) -> str:
+    """Return what `write_table` writes; a CalibError if the columns differ in length."""
+    cells = {name: _format(values) for name, values in columns.items()}
+    lengths = {name: len(column) for name, column in cells.items()}
+    if len(set(lengths.values())) > 1:
+        raise CalibError(
+            f"the columns differ in length: {lengths}",
+            expected="columns of one length",
+            hint="pass arrays of shape (n,)",
+        )
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(cells)
+    writer.writerows(zip(*cells.values(), strict=True))
+    return text.getvalue()
 
 
 def _format(values: ArrayLike | Sequence[str]) -> list[str]:

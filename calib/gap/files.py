@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from calib.data import write_table
-from calib.data.files import inside
+from calib.data.files import inside, table_csv
 from calib.errors import FAULTS, CalibError
 from calib.gap.case import words_of
 from calib.gap.corrected import load_corrected, save_corrected
 from calib.gap.describe import gap_document
 from calib.gap.diagnose import Diagnosis
-from calib.gap.document import BENCH, FILE, Cause, Explanation, GapDocument
+from calib.gap.document import BENCH, Cause, Explanation, GapDocument
+from calib.gap.document import FILE as DOCUMENT
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.mixture import Region, row_gaps
 
@@ -93,15 +93,28 @@ def write_diagnosis(found: Diagnosis, folder: Path, d: GapDocument | None = None
     d : GapDocument, optional
         Of the diagnosis, if it was computed before.
     """
-    d = d or gap_document(found)
-    (folder / FILE).write_bytes(d.json())
-    (folder / "diagnosis.json").write_text(json.dumps(contract(d), indent=1) + "\n")
     save_corrected(found.corrected, folder)
-    if d.prediction:
-        write_table(
-            folder / "fresh_prediction.csv",
-            {n: [*v] if isinstance(v[0], str) else np.array(v) for n, v in d.prediction.items()},
-        )
+    for name, content in program_files(d or gap_document(found)).items():
+        (folder / name).write_bytes(content)
+
+
+def program_files(d: GapDocument) -> dict[str, bytes]:
+    """Return the files that programs read of a diagnosis by name, from its document alone."""
+    made = {name: make(d) for name, make in FILES.items()}
+    return {name: text.encode() for name, text in made.items() if text}
+
+
+def _prediction(d: GapDocument) -> str:
+    columns = d.prediction.items()
+    return table_csv({n: [*v] if isinstance(v[0], str) else np.array(v) for n, v in columns})
+
+
+FILES: Mapping[str, Callable[[GapDocument], str]] = {
+    DOCUMENT: lambda d: d.json().decode(),
+    "diagnosis.json": lambda d: json.dumps(contract(d), indent=1) + "\n",
+    "fresh_prediction.csv": lambda d: _prediction(d) if d.prediction else "",
+}
+"""How each file for programs follows from the document; one without content is not written."""
 
 
 def _parameters(explanation: Explanation) -> dict[str, dict[str, float]]:

@@ -200,12 +200,14 @@ def skewed(s: ParameterSummary) -> bool:
     """Whether mean and sd would mislead.
 
     They do where the HDI reaches more than twice as far on one side of the median as on the
-    other, or spans more than a factor of 30.
+    other, or spans more than a factor of 30, or where heavy tails make the sd more than half as
+    long as the HDI (a quarter if normal).
     """
     near, far = sorted((s.median - s.hdi_lower, s.hdi_upper - s.median))
     low, high = sorted((abs(s.hdi_lower), abs(s.hdi_upper)))
     one_sign = s.hdi_lower * s.hdi_upper > 0.0
-    return far > LOPSIDED * near or (one_sign and high > DECADES * low)
+    tails = s.sd > 0.5 * (s.hdi_upper - s.hdi_lower)
+    return tails or far > LOPSIDED * near or (one_sign and high > DECADES * low)
 
 
 def end_scales(s: ParameterSummary) -> tuple[float, float]:

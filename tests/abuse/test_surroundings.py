@@ -44,7 +44,7 @@ from tests.gap.cases import PULL_ONLY, make_case, write_case
 from tests.models.simulators.examples import PRIORS, lab, write_program
 from tests.registered import forgotten
 
-PROGRAM = [sys.executable, "-c", "from calib.cli import program; program()"]
+PROGRAM = [sys.executable, "-c", "from calib.cli import main; main()"]
 FIT = ["fit", "ruts.csv", "--model", "bekker", "--max-steps", "400", "--out", "run"]
 THETA = np.array([0.6, 0.08])
 X = {"slip_ratio": np.array([0.1, 0.2]), "normal_load_kn": np.array([4.0, 5.0])}
@@ -672,8 +672,8 @@ class Interrupted:
                 pass
             raise ImportError("initialization failed")
 sys.meta_path.insert(0, Interrupted)
-from calib.cli import program
-program()
+from calib.cli import main
+main()
 """
     done = subprocess.run(
         [sys.executable, "-c", code, *FIT], capture_output=True, text=True, check=False,

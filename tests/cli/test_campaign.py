@@ -20,8 +20,8 @@ from tests.commands import Calib, Ran
 FROM_A_TERMINAL = """
 import signal
 signal.signal(signal.SIGINT, signal.default_int_handler)
-from calib.cli import program
-program()
+from calib.cli import main
+main()
 """
 RANKS = '[[sbc]]\nname = "ranks"\nsimulations = 400\ndraw_seed = 3\nmodels = ["bekker"]\n'
 CASES = '[[challenge]]\nname = "blind"\ncases = {}\ndraw_seed = 5\ntier = "easy"\n'

@@ -155,7 +155,7 @@ BUFFERED = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"}
 
 def test_what_code_of_ones_own_has_open_is_written(tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text("LOG = open('log.txt', 'w')\nLOG.write('loaded')\n")
-    program = [sys.executable, "-c", "from calib.cli import program; program()"]
+    program = [sys.executable, "-c", "from calib.cli import main; main()"]
     ran = subprocess.run(
         [*program, "models", "--models", "own.py"], cwd=tmp_path, capture_output=True, text=True,
         check=False, env=BUFFERED,
@@ -179,7 +179,7 @@ def test_without_a_place_to_write_to_the_exit_code_says_it(to: str, code: int) -
 @pytest.mark.skipif(sys.platform == "win32", reason="of a shell")
 def test_a_job_that_closed_its_output_is_told_the_same(tmp_path: Path) -> None:
     (tmp_path / "my.csv").write_text(example_csv("bekker"))
-    program = [sys.executable, "-c", "from calib.cli import program; program()"]
+    program = [sys.executable, "-c", "from calib.cli import main; main()"]
     for words in (["fit", "my.csv", "--model", "bekker", "--out", "run", "--max-steps", "800"],
                   ["check", "run", "--quick"], ["predict", "run", "--at", "my.csv"]):  # fmt: skip
         ran = subprocess.run(
@@ -219,8 +219,8 @@ class Interrupted:
                 raise
 sys.meta_path.insert(0, Interrupted)
 signal.signal(signal.SIGINT, signal.default_int_handler)
-from calib.cli import program
-program()
+from calib.cli import main
+main()
 """
     (tmp_path / "my.csv").write_text(example_csv("bekker"))
     command = [sys.executable, "-c", code, "fit", "my.csv", "--model", "bekker"]

@@ -15,7 +15,7 @@ COMMANDS = {
     "end", "footnotesize", "gamma", "label", "ldots", "le", "ge", "mathrm", "midrule", "mu",
     "paragraph", "pm", "raggedright", "rlap", "sigma", "sin", "small", "tabularnewline", "tau",
     "textasciicircum", "textbackslash", "texttt", "textwidth", "theta", "times", "toprule",
-    "textasciitilde", "circ", *GREEK,
+    "textasciitilde", "textbf", "circ", *GREEK,
 }  # fmt: skip
 MATH_ONLY = {
     "arctan", "ast", "circ", "cos", "exp", "frac", "int", "le", "ge", "mathrm", "pm", "sin", "sqrt",

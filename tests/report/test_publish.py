@@ -305,8 +305,15 @@ def latex(published) -> dict[str, str]:
 
 
 def test_every_topic_has_both_forms(published, tables):
-    topics = {topic: (path, tex) for topic, path, tex in published.tables()}
-    assert set(topics) == {"Posterior", "Estimates", "Validation", "Convergence", "Priors"}
+    topics = {topic: (path, tex) for topic, path, tex in published.tables}
+    assert set(topics) == {
+        "Posterior",
+        "Sensitivity",
+        "Estimates",
+        "Validation",
+        "Convergence",
+        "Priors",
+    }
     assert sum(len(tex) for _, tex in topics.values()) == len(latex(published))
     for found in tables.values():
         assert found

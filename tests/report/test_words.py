@@ -225,6 +225,7 @@ def summary(mean, sd, low, high, median=2.0) -> ParameterSummary:
         (summary(-2.0, 1.0, -3.5, -0.1, -2.0), True),
         (summary(2.0, 1.0, 0.13, 3.5), False),
         (summary(2.0, 1.0, -0.01, 3.5), False),
+        (summary(2.0, 2.0, 0.1, 3.8), True),
     ],
 )
 def test_where_a_mean_would_mislead(s, expected):

@@ -18,15 +18,7 @@ from calib.report.markup import prose, to_html
 from calib.report.numbers import TIMES
 from calib.report.page.template import equation, parametrisation, picture, template
 from calib.report.publish import Publication, likelihood
-from calib.report.publish.tables import (
-    TICK,
-    Table,
-    estimates_table,
-    posterior_table,
-    pressure_table,
-    priors_table,
-    sensitivity_table,
-)
+from calib.report.publish.tables import TICK, TOPICS
 from calib.report.sections import Section, emulation_words
 from calib.report.study import OutputResult, Study
 from calib.report.verdict import Level
@@ -44,17 +36,6 @@ def cell(text: str, ticks: bool = False) -> Markup:
     """Write a cell for a page; beside cells with ticks it keeps room for one."""
     body, tick = to_html(text.removesuffix(TICK)), TICK if text.endswith(TICK) else ""
     return body + Markup('<span class="tick">{}</span>').format(tick) if ticks else body
-
-
-def tables_of(o: Output) -> dict[str, Table | None]:
-    """Return the tables on the page of an output."""
-    return {
-        "posterior": posterior_table(o),
-        "sensitivity": sensitivity_table(o) if o.found["prior_sensitivity"]["parameters"] else None,
-        "estimates": estimates_table(o),
-        "by_pressure": pressure_table(o),
-        "priors": priors_table(o),
-    }
 
 
 def section(o: Output, result: OutputResult, drawn: Drawn | None) -> dict[str, Any]:
@@ -75,7 +56,7 @@ def section(o: Output, result: OutputResult, drawn: Drawn | None) -> dict[str, A
         "equation": equation(bound.model.latex, bound.model.numbers),
         "likelihood": to_html(likelihood(o)),
         "parametrisation": said(parametrisation(bound.model.parametrisation, bound.references)),
-        "tables": tables_of(o),
+        "tables": {name: topic.of_output(o) for name, topic in TOPICS.items()},
         "figures": {
             p.name: {
                 **picture(p, drawn.files.get(f"{o.key}_{p.name}.png", b""), said(p.caption)),

@@ -1,8 +1,7 @@
-"""The files of a diagnosis that people read, and its JSON: pure functions of its document."""
+"""The files of a diagnosis: pure functions of its document."""
 
 from __future__ import annotations
 
-import json
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any
 
 from calib.gap.constants import LEFT, MIN_EFFECT_SIZE, MIN_EFFECT_SIZE_IN_PAIR, MOST_LEFT
 from calib.gap.document import Explanation, GapDocument
-from calib.gap.files import contract
+from calib.gap.files import program_files
 from calib.report.figures.plate import Plate
 from calib.report.gap_verdict import Tone, tied
 from calib.report.gap_words import Words, short_name
@@ -27,7 +26,7 @@ TONE_MARKS = {
 
 
 def render_diagnosis(d: GapDocument) -> dict[str, bytes]:
-    """Render the page, the figures and the JSON file of a diagnosis from its document alone.
+    """Render the files of a diagnosis from its document alone: page, figures, files for programs.
 
     Parameters
     ----------
@@ -37,8 +36,19 @@ def render_diagnosis(d: GapDocument) -> dict[str, bytes]:
     Returns
     -------
     dict of str to bytes
-        Files by name: ``index.html``, ``figures/*.png``, ``diagnosis.json``.
+        Files by name: ``index.html``, ``figures/*.png``, and those of `calib.gap.files.FILES`.
     """
+    return {**_page_files(d), **program_files(d)}
+
+
+def write_page(d: GapDocument, folder: Path) -> None:
+    """Write the page and the figures of a diagnosis into an existing folder."""
+    (folder / "figures").mkdir(exist_ok=True)
+    for name, content in _page_files(d).items():
+        (folder / name).write_bytes(content)
+
+
+def _page_files(d: GapDocument) -> dict[str, bytes]:
     from calib.report.figures.gap import gap_plates
     from calib.report.figures.style import png
 
@@ -46,16 +56,8 @@ def render_diagnosis(d: GapDocument) -> dict[str, bytes]:
     images = {p.name: png(p) for p in plates if p.figure is not None}
     return {
         "index.html": render_page(d, plates, images).encode(),
-        "diagnosis.json": (json.dumps(contract(d), indent=1) + "\n").encode(),
         **{f"figures/{name}.png": image for name, image in images.items()},
     }
-
-
-def write_page(d: GapDocument, folder: Path) -> None:
-    """Write the page and the figures of a diagnosis into an existing folder."""
-    (folder / "figures").mkdir(exist_ok=True)
-    for name, content in render_diagnosis(d).items():
-        (folder / name).write_bytes(content)
 
 
 def render_page(d: GapDocument, plates: Sequence[Plate], images: Mapping[str, bytes]) -> str:

@@ -16,7 +16,6 @@ from typing import Any
 from jinja2 import UndefinedError
 
 from calib.data.reader import KNOWN_DATA
-from calib.inference.constants import PROPOSED
 from calib.inference.estimators import METHODS
 from calib.report.document import Output, outputs
 from calib.report.labels import joined
@@ -41,6 +40,8 @@ class Publication:
     ----------
     files : mapping of str to str
         Text by path in the report's folder.
+    tables : tuple of (str, str, tuple of str)
+        Topic, CSV file and LaTeX files of every table.
     methods : tuple of (str, str)
         Heading, empty for the first, and text of every paragraph of the methods.
     references : tuple of str
@@ -48,18 +49,9 @@ class Publication:
     """
 
     files: Mapping[str, str]
+    tables: tuple[tuple[str, str, tuple[str, ...]], ...]
     methods: tuple[tuple[str, str], ...]
     references: tuple[str, ...]
-
-    def tables(self) -> list[tuple[str, str, tuple[str, ...]]]:
-        """Return topic, CSV file and LaTeX files of every table."""
-        topics = []
-        for path in self.files:
-            stem, _, form = path.rpartition(".")
-            if form == "csv":
-                tex = tuple(p for p in self.files if p.startswith(stem) and p.endswith(".tex"))
-                topics.append((stem.removeprefix("tables/").capitalize(), path, tex))
-        return topics
 
 
 def publication(manifest: Mapping[str, Any], summary: Mapping[str, Any]) -> Publication:
@@ -69,20 +61,29 @@ def publication(manifest: Mapping[str, Any], summary: Mapping[str, Any]) -> Publ
     """
     found = outputs(manifest, summary)
     if not found:
-        return Publication({}, (), ())
+        return Publication({}, (), (), ())
     version = str(manifest["versions"]["terracalib"])
     paragraphs = methods(manifest, found)
     label = ", ".join(dict.fromkeys(o.label for o in found if o.label))
-    tables = [_labelled(t, label) for t in latex_tables(found, manifest["settings"]["gate"])]
+    by_topic = {
+        topic: [_labelled(t, label) for t in tables]
+        for topic, tables in latex_tables(found, manifest["settings"]["gate"]).items()
+    }
+    tables = [t for some in by_topic.values() for t in some]
     said = [sentence for _, sentences in paragraphs for sentence in sentences]
     references = bibliography(cited(said), version)
     texts = [(heading, " ".join(map(to_text, sentences))) for heading, sentences in paragraphs]
     files = {f"tables/{name}.csv": write_csv(t) for name, t in csv_tables(found).items() if t}
+    links = tuple(
+        (topic.capitalize(), path, tuple(f"tables/{t.label}.tex" for t in some))
+        for topic, some in by_topic.items()
+        if (path := f"tables/{topic}.csv") in files
+    )
     files |= {f"tables/{t.label}.tex": t.latex() for t in tables}
     files["methods.txt"] = _text(texts, references)
     files["methods.tex"] = _tex(paragraphs)
     files["references.bib"] = bibtex(cited([*said, *(t.caption for t in tables)]), version)
-    return Publication(files, tuple(texts), tuple(references))
+    return Publication(files, links, tuple(texts), tuple(references))
 
 
 def _labelled(table: Table, label: str) -> Table:
@@ -101,7 +102,6 @@ def methods(manifest: Mapping[str, Any], found: Sequence[Output]) -> list[Paragr
             seed=manifest["seed"], command=shlex.join(map(str, manifest["command"])),
             labels=[label for label in labels if label in KNOWN_DATA], known=KNOWN_DATA,
             genetic=any("genetic" in o.found["estimates"] for o in found),
-            proposed=PROPOSED,
             digits=12,  # of a hash, which tell two files apart; the manifest has all of them
             outputs=[(o, _words(o)) for o in found], format_value=format_value,
         )  # fmt: skip

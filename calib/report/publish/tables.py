@@ -1,13 +1,14 @@
 """The tables of a report, each declared once: for the page, for LaTeX and for programs.
 
-To add one, write a function that returns it and list it in `TOPICS`. Cells, heads and captions are
-text with marks (`calib.report.markup`).
+To add one, write a function that returns it and one that yields its rows for programs, and list
+both in `TOPICS`. Cells, heads and captions are text with marks (`calib.report.markup`).
 """
 
 from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -44,7 +45,7 @@ type Row = Mapping[str, str]
 class Table:
     """Rows for people, in groups with a rule between them.
 
-    The label names its file; `columns` is LaTeX's column specification.
+    The label names its file; `columns` is LaTeX's column specification, in which text is l or p.
     """
 
     label: str
@@ -56,6 +57,12 @@ class Table:
     def head(self) -> list[str]:
         """Heads of the columns."""
         return list(next(row for group in self.groups for row in group))
+
+    @property
+    def texts(self) -> list[bool]:
+        """Whether each column is of text; one that only a page has is."""
+        found = [kind != "r" for kind in re.findall(r"([lrp])(?:\{[^}]*\})?", self.columns)]
+        return found + [True] * (len(self.head) - len(found))
 
     @property
     def rows(self) -> list[list[str]]:
@@ -122,7 +129,7 @@ def posterior_table(o: Output) -> Table:
         f"posterior_{o.key}",
         f"{'' if o.converged else 'NOT CONVERGED, not to be used. '}Posterior of the parameters of "
         f"{o.model_words} from {o.found['data']['n']} rows of {o.data_words}: mean ± standard "
-        "deviation (sd), or the median where the interval is lopsided or spans decades; 95 % "
+        "deviation (sd), or the median where that would mislead; 95 % "
         "highest-density interval (HDI); effective sample sizes (ESS), R-hat [@Vehtari_2021], and "
         f"the sd over that of the prior.{below if derived else ''}",
         "lrrrrrr",
@@ -162,9 +169,24 @@ def posterior_rows(o: Output) -> Iterator[Row]:
         }  # fmt: skip
 
 
-def sensitivity_table(o: Output) -> Table:
-    """Return what each parameter owes to the prior and to the data."""
+def sensitivity_rows(o: Output) -> Iterator[Row]:
+    """Yield what each parameter owes to the prior and to the data."""
+    for name, s in o.found["prior_sensitivity"]["parameters"].items():
+        yield {
+            "parameter": name,
+            "contraction": ascii_text(_number(s["contraction"], 4)),
+            "reacts_to_prior": ascii_text(_number(s["prior"], 2)),
+            "reacts_to_data": ascii_text(_number(s["likelihood"], 2)),
+            "identified": _yes(s["identified"]).lower(),
+            "reading": s["reading"],
+        }
+
+
+def sensitivity_table(o: Output) -> Table | None:
+    """Return what each parameter owes to the prior and to the data; None if that is not known."""
     found, limits = o.found["prior_sensitivity"]["parameters"], o.found["prior_sensitivity"]
+    if not found:
+        return None
     criteria = limits["criteria"]
     unknown = ", ".join(f"[${name}]" for name, s in found.items() if not s["identified"])
     said = f"Not identified by these data: {unknown}." if unknown else (
@@ -343,7 +365,7 @@ def _errors(o: Output) -> list[str]:
     return [_number(None if v[k] is None else f * v[k], n) for k, f, n in wanted]
 
 
-def validation_table(found: Sequence[Output]) -> Table:
+def validation_table(found: Sequence[Output], gate: Mapping[str, float]) -> Table:
     """Return the scores of every output."""
     labels = sorted({o.label for o in found if o.label})
     rows = []
@@ -466,33 +488,62 @@ def priors_rows(o: Output) -> Iterator[Row]:
         yield {"parameter": name, **said, "file_sha256": o.task["priors"]["sha256"]}
 
 
-type _Each = Callable[[Output], Table | None]
+@dataclass(frozen=True)
+class Topic:
+    """A subject of tables, on the page, for LaTeX and for programs.
 
-TOPICS: Mapping[str, tuple[Callable[[Output], Iterator[Row]], tuple[_Each, ...]]] = {
-    "posterior": (posterior_rows, (posterior_table,)),
-    "estimates": (estimates_rows, (estimates_table, pressure_table)),
-    "validation": (validation_rows, ()),
-    "convergence": (convergence_rows, ()),
-    "priors": (priors_rows, (priors_table,)),
+    Parameters
+    ----------
+    rows : callable
+        The rows of an output for programs.
+    each : tuple of callable
+        Tables of one output for people, None where it has none; the page shows them with it.
+    together : callable, optional
+        The table of all outputs for people, given the limits of the gate.
+    """
+
+    rows: Callable[[Output], Iterator[Row]]
+    each: tuple[Callable[[Output], Table | None], ...] = ()
+    together: Callable[[Sequence[Output], Mapping[str, float]], Table] | None = None
+
+    def of_output(self, o: Output) -> list[Table]:
+        """Return the tables of an output."""
+        return [table for make in self.each if (table := make(o)) is not None]
+
+
+TOPICS: Mapping[str, Topic] = {
+    "posterior": Topic(posterior_rows, (posterior_table,)),
+    "sensitivity": Topic(sensitivity_rows, (sensitivity_table,)),
+    "estimates": Topic(estimates_rows, (estimates_table, pressure_table)),
+    "validation": Topic(validation_rows, together=validation_table),
+    "convergence": Topic(convergence_rows, together=convergence_table),
+    "priors": Topic(priors_rows, (priors_table,)),
 }
-"""By topic: the rows of an output for programs, and its tables for people."""
+"""All tables. One whose place the page's template does not name stands at the end of its output."""
 
 
 def csv_tables(found: Sequence[Output]) -> dict[str, list[Row]]:
     """Return the rows of every topic for programs; what reconstructed data are called, if any."""
     labelled = any(o.label for o in found)
     return {
-        topic: [
-            {"output": o.key, **({"data_label": o.label} if labelled else {}),
-             "model": o.model.name} | dict(row)
-            for o in found for row in rows(o)
+        name: [
+            {
+                "output": o.key,
+                **({"data_label": o.label} if labelled else {}),
+                "model": o.model.name,
+                **row,
+            }
+            for o in found
+            for row in topic.rows(o)
         ]
-        for topic, (rows, _) in TOPICS.items()
-    }  # fmt: skip
+        for name, topic in TOPICS.items()
+    }
 
 
-def latex_tables(found: Sequence[Output], gate: Mapping[str, float]) -> list[Table]:
-    """Return all tables for people: of each output, and of all together."""
-    each = [table(o) for _, tables in TOPICS.values() for table in tables for o in found]
-    made = [*each, validation_table(found), convergence_table(found, gate)]
-    return [table for table in made if table is not None]
+def latex_tables(found: Sequence[Output], gate: Mapping[str, float]) -> dict[str, list[Table]]:
+    """Return the tables for people by topic: of each output, and of all together."""
+    return {
+        name: [table for o in found for table in topic.of_output(o)]
+        + ([topic.together(found, gate)] if topic.together else [])
+        for name, topic in TOPICS.items()
+    }

@@ -12,11 +12,12 @@ from matplotlib.figure import Figure
 
 from calib.data import read_table
 from calib.models import MODELS, example_csv
+from calib.report.document import Output
 from calib.report.figures.collect import Drawn
 from calib.report.figures.plate import Plate
-from calib.report.page.content import render_page, tables_of
+from calib.report.page.content import render_page
 from calib.report.page.template import equation, parametrisation
-from calib.report.publish.tables import TICK
+from calib.report.publish.tables import TICK, TOPICS, Table
 from calib.report.sections import EmulatorSection
 from calib.report.study import Failure, Study
 from tests.report.conftest import records
@@ -202,6 +203,12 @@ def output(key: str, results):
 
     (o,) = (o for o in outputs(*records(results)) if o.key == key)
     return replace(o, facts=page_facts(results[key]))
+
+
+def tables_of(o: Output) -> dict[str, Table]:
+    made = {name: topic.of_output(o) for name, topic in TOPICS.items()}
+    by_pressure = [("by_pressure", table) for table in made["estimates"][1:]]
+    return {name: tables[0] for name, tables in made.items() if tables} | dict(by_pressure)
 
 
 def by_name(table) -> dict[str, dict[str, str]]:
