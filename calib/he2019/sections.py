@@ -18,7 +18,6 @@ from calib.gap.files import write_diagnosis
 from calib.he2019 import declared
 from calib.he2019.audit import (
     Audit,
-    Finding,
     Quantity,
     Seeds,
     Verdict,
@@ -44,7 +43,7 @@ from calib.report.labels import MINUS, odds_text, percent, percent_range, unbrok
 from calib.report.markup import unit_html
 from calib.report.numbers import NOTHING, format_number
 from calib.report.page.diagnosis import TONE_MARKS, render_page
-from calib.report.page.template import data_uri, picture, png_size, sentences, template
+from calib.report.page.template import picture, sentences, template
 from calib.report.sections import Section, Target
 from calib.report.study import Progress, Study
 
@@ -88,21 +87,13 @@ def write_audit_page(audit: Audit, folder: Path, command: Sequence[str]) -> None
 
 def audit_section(audit: Audit, plates: Sequence[Plate], images: Mapping[str, bytes]) -> str:
     """Render verdicts, evidence and figures; images are PNG files by the name of their plate."""
-    groups = [
-        {
-            "id": verdict.name.lower(), "verdict": verdict.value, "mark": AUDIT_MARKS[verdict],
-            "meaning": verdict.meaning, "n": n,
-            "rows": [_row(f) for f in audit.findings if f.verdict is verdict],
-        }
-        for verdict, n in audit.counts.items()
-    ]  # fmt: skip
     figures = [
         picture(p, images.get(p.name, b""), _text(p.caption)) | {"name": p.name.replace("_", "-")}
         for p in plates
     ]
     return template("audit.html.j2", "calib.he2019").render(
-        groups=groups, figures=figures, total=len(audit.findings),
-        free=sum(not f.reconstructed for f in audit.findings),
+        audit=audit, marks=AUDIT_MARKS, text=_text, quantity=_quantity, figures=figures,
+        nothing=NOTHING,
     )  # fmt: skip
 
 
@@ -110,16 +101,6 @@ def _text(text: str) -> str:
     """Write minus signs and powers as a reader expects them."""
     signed = re.sub(r"(?<![\w.])-(?=[\d.,)])", MINUS, text)
     return unbroken(re.sub(r"(kN|psi|R|g/cm)\^([23])", lambda m: m[1] + "²³"[m[2] == "3"], signed))
-
-
-def _row(finding: Finding) -> dict[str, Any]:
-    return {
-        "key": finding.key, "where": finding.where, "claim": _text(finding.claim),
-        "test": _text(_upper(finding.test)), "evidence": _text(finding.evidence),
-        "stays_open": _text(finding.stays_open) or NOTHING, "basis": finding.basis.value,
-        "caveat": finding.basis.caveat, "reconstructed": finding.reconstructed,
-        "found": [_quantity(q) for q in finding.found],
-    }  # fmt: skip
 
 
 def _quantity(q: Quantity) -> dict[str, Any]:
@@ -138,17 +119,16 @@ def _quantity(q: Quantity) -> dict[str, Any]:
     }  # fmt: skip
 
 
-_CHECKS = declared("checks.toml")
-# Numbers that not every check of a kind has.
-_ABSENT = dict.fromkeys(("rmse_before_mm", "rmse_after_mm", "largest_relative_after"), 0.0)
-_said = sentences(odds=odds_text)
+_CHECKS, _said = declared("checks.toml"), sentences(odds=odds_text)
 
 
 def check_text(name: str, values: Mapping[str, float]) -> tuple[str, str]:
     """Return the heading of a check and what it found."""
     words = _CHECKS.get(name)
     if words is not None:
-        return words["heading"], _said(words["text"], **{**_ABSENT, **values})
+        # Numbers that not every check of a kind has.
+        absent = dict.fromkeys(("rmse_before_mm", "rmse_after_mm", "largest_relative_after"), 0.0)
+        return words["heading"], _said(words["text"], **{**absent, **values})
     # The same question asked otherwise: the probabilities.
     named = ((k.removeprefix("probability_"), p) for k, p in values.items() if k != "rows")
     listed = ", ".join(f"{short_name(name)} {odds_text(p)}" for name, p in named)
@@ -157,7 +137,8 @@ def check_text(name: str, values: Mapping[str, float]) -> tuple[str, str]:
 
 def _write_gap(
     result: FoundGap, folder: Path, versions: Mapping[str, str], pdf: bool
-) -> dict[str, Any]:
+) -> Mapping[str, Any]:
+    """Write figure and page of a gap, and return what the template shows of it."""
     # Late: where the figures are drawn, which as a rule is another process.
     from calib.he2019.figures import gap_plate
     from calib.report.figures.gap import gap_plates
@@ -165,10 +146,10 @@ def _write_gap(
 
     plate = gap_plate(result)
     image = png(plate)
-    (folder / "figures" / f"gap_{plate.name}.png").write_bytes(image)
+    file = folder / "figures" / f"gap_{plate.name}.png"
+    file.write_bytes(image)
     if pdf and plate.figure is not None:
-        file = folder / "figures" / f"gap_{plate.name}.pdf"
-        file.write_bytes(pdf_bytes(plate.figure))
+        file.with_suffix(".pdf").write_bytes(pdf_bytes(plate.figure))
     inner = folder / "gaps" / result.gap.name
     inner.mkdir(parents=True)
     document = replace(result.document, versions=dict(versions))
@@ -176,38 +157,27 @@ def _write_gap(
     drawn = gap_plates(document)
     images = {p.name: png(p) for p in drawn if p.figure is not None}
     (inner / "index.html").write_text(render_page(document, drawn, images), encoding="utf-8")
-    return _block(result, plate, image)
+    return gap_block(result, plate, image)
 
 
-def _block(result: FoundGap, plate: Plate, image: bytes) -> dict[str, Any]:
+def gap_block(result: FoundGap, plate: Plate, image: bytes) -> Mapping[str, Any]:
+    """Return what ``gaps.html.j2`` shows of a gap."""
     gap, found = result.gap, result.found
     verdict, ranking, case = gap_verdict(result.document), found.ranking, found.data.case
-    best = ranking.order[0]
-    named = best == gap.withheld and found.verdict == "effect"
-    s = found.shrink.get(result.output)
+    best, shrink = ranking.order[0], found.shrink.get(result.output)
     return {
-        "name": gap.name, "title": gap.title, "question": gap.question, "limits": gap.limits,
-        "rows": [
-            ("Model", get_model(case.models[result.output]).title),
-            ("Calibration", f"{_upper(gap.lab_rows)}: {len(case.lab)} rows"),
-            ("Field", f"{_upper(gap.field_rows)}: {len(case.field)} rows"),
-        ],
-        "tone": verdict.tone.value, "mark": TONE_MARKS[verdict.tone], "state": verdict.state,
-        "headline": verdict.headline,
+        "gap": gap, "model": get_model(case.models[result.output]).title,
+        "rows": (len(case.lab), len(case.field)),
+        "verdict": verdict, "mark": TONE_MARKS[verdict.tone],
         "facts": [fact for fact in verdict.facts if fact[0] not in ("Next", "Then")],
-        "withheld": gap.withheld and short_name(gap.withheld), "named": named,
-        "withheld_odds": gap.withheld and odds_text(probability_of(found, gap.withheld)),
-        "best": f"{short_name(best)} ({odds_text(ranking.probability[best])})",
-        "shrink": f"{percent(s.fraction)} ({percent_range(s.interval)})" if s
-        else "no gap that could shrink",
+        "withheld": gap.withheld and short_name(gap.withheld),
+        "named": best == gap.withheld and found.verdict == "effect",
+        "withheld_probability": gap.withheld and probability_of(found, gap.withheld),
+        "best": short_name(best), "probability": ranking.probability[best],
+        "shrink": shrink and f"{percent(shrink.fraction)} ({percent_range(shrink.interval)})",
         "checks": [check_text(*check) for check in checks(result).items()],
-        "page": f"gaps/{gap.name}/index.html", "caption": plate.caption, "uri": data_uri(image),
-        "size": png_size(image),
+        "picture": picture(plate, image, plate.caption),
     }  # fmt: skip
-
-
-def _upper(text: str) -> str:
-    return text[0].upper() + text[1:]
 
 
 # The sections, as the report asks for them

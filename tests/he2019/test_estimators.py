@@ -9,20 +9,15 @@ from scipy.optimize import brentq
 from calib.data import table_from_arrays
 from calib.errors import CalibError
 from calib.he2019.estimators import Features, coefficients, read_features, rut_regression
+from calib.he2019.published import PUBLISHED
 from calib.inference.estimators import estimate
 from calib.inference.problem import build_problem
 from calib.models.magic_formula import magic_formula
 
-TABLE_3 = {
-    18: (0.0540, 1.4743, 1.6397, -15.1235),
-    30: (0.0566, 1.5664, 1.0058, -14.0852),
-    42: (0.0943, 1.4476, 0.5740, -13.1655),
-}
-TABLE_4 = {
-    18: (0.0794, 1.5619, 1.6480, -0.1026),
-    30: (0.0713, 1.5685, 1.0071, -6.0844),
-    42: (0.1265, 1.4802, 0.5954, -8.1747),
-}
+TABLE_3, TABLE_4 = (
+    {psi: tuple(table.values.values()) for psi, table in tables.items()}
+    for tables in (PUBLISHED.geometric, PUBLISHED.genetic)
+)
 FIXED = {"Sh": 0.0, "Sv": 0.0}
 
 
@@ -76,6 +71,17 @@ def test_parabola_finds_the_slip_of_the_peak():
     assert got.peak == pytest.approx(y.max())
 
 
+def test_repeats_are_averaged_and_order_does_not_matter():
+    x = np.array([1.0, 3.0, 5.0, 10.0, 20.0, 40.0])
+    y = np.array([0.1, 0.3, 0.5, 0.8, 0.7, 0.6])
+    noise = np.array([0.05, -0.05, 0.03, 0.02, -0.04, 0.01])
+    twice_x, twice_y = np.tile(x, 2), np.concatenate([y + noise, y - noise])
+    order = np.random.default_rng(0).permutation(12)
+    a = read_features(x, y)
+    b = read_features(twice_x[order], twice_y[order])
+    np.testing.assert_allclose(b[1:4], a[1:4], rtol=1e-12)
+
+
 def test_zero_is_found_where_it_is_asked_for():
     x = np.array([0.0, 2.5, 5.0, 10.0, 20.0, 30.0, 50.0])
     y = magic_formula(x, 0.1, 1.5, 1.0, -2.0, Sh=-2.0)
@@ -105,6 +111,15 @@ def test_no_peak_inside_the_range():
     assert "no peak" in found.note
     assert found.reported["C"] == 1.5
     assert np.isfinite(found.cost)
+
+
+def test_dense_noisy_data():
+    rng = np.random.default_rng(4)
+    x = rng.uniform(0.0, 70.0, 3000)
+    y = magic_formula(x, *TABLE_4[30]) + 0.05 * rng.standard_normal(x.size)
+    found = estimate(build(x, y), "geometric", rng)
+    assert found.reported["D"] == pytest.approx(1.007, rel=0.05)
+    assert found.r_squared > 0.8
 
 
 @pytest.mark.parametrize("pressures", [(18, 42), (18, 30, 42)])

@@ -28,7 +28,7 @@ from calib.he2019.gaps import (
     write_cases,
 )
 from calib.he2019.published import PUBLISHED
-from calib.he2019.sections import GapsSection, _block, check_text
+from calib.he2019.sections import GapsSection, check_text, gap_block
 from calib.inference.calibration import calibrate
 from calib.inference.sampler import SamplerSettings
 from calib.models import get_model
@@ -327,7 +327,7 @@ def test_an_effect_that_is_not_found_is_said_not_to_be(found_gaps):
     """Rendered from what a section shows of a gap."""
     result = found_gaps["held_out_pull"]
     other = replace(result, gap=replace(result.gap, withheld="slip_zero_shift"))
-    block = _block(other, Plate(None, "held_out_pull", "A caption."), PNG)
+    block = gap_block(other, Plate(None, "held_out_pull", "A caption."), PNG)
     said = flat(template("gaps.html.j2", "calib.he2019").render(gaps=[block]))
     assert "withheld, slip zero shift, is not the one that is named" in said
 
