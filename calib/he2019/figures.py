@@ -250,10 +250,11 @@ def _exponents(ax: Axes, audit: Audit) -> None:
     study, values = audit.inverse, audit.published.rut_depth.values
     factor = float(attenuation(audit.published).middle)
     shown = 1500
-    every = max(1, study.n0.size // shown)
+    n0_n1 = np.column_stack([study.draws["n0"], study.draws["n1"]])
+    every = max(1, len(n0_n1) // shown)
     clouds = (
         ("Eq 22 in simulated campaigns, 95 %", study.simulated[:shown, :2], "#8f8f8f", DASHES[1]),
-        ("posterior, 95 %", np.column_stack([study.n0, study.n1])[::every], BLUE, "-"),
+        ("posterior, 95 %", n0_n1[::every], BLUE, "-"),
     )
     for name, points, colour, dashes in clouds:
         _marks(ax, points[:, 0], points[:, 1], ".", colour, ms=1.5, alpha=0.35)
@@ -282,9 +283,10 @@ def _ellipse(points: Array) -> tuple[Array, Array]:
 def _by_pressure(ax: Axes, audit: Audit) -> None:
     study, values = audit.inverse, audit.published.rut_depth.values
     pressure = np.geomspace(60.0, 320.0, 60)
-    some = (v[:: max(1, v.size // 2000), None] for v in (study.k, study.n0, study.n1))
-    draws = 1000.0 * rut_depth(pressure, _AT_SLIP, *some)
-    low, middle, high = np.quantile(draws, [0.025, 0.5, 0.975], axis=0)
+    draws = (study.draws[name] for name in ("k", "n0", "n1"))
+    some = (v[:: max(1, v.size // 2000), None] for v in draws)
+    ruts = 1000.0 * rut_depth(pressure, _AT_SLIP, *some)
+    low, middle, high = np.quantile(ruts, [0.025, 0.5, 0.975], axis=0)
     _band(ax, pressure, low, high, "mean rut, posterior 95 %")
     _line(ax, pressure, middle, BLUE, "mean rut, posterior median", lw=1.4)
     printed = 1000.0 * rut_depth(pressure, _AT_SLIP, values["k"], values["n0"], values["n1"])

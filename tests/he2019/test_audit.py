@@ -88,7 +88,7 @@ def test_what_rests_on_reconstructed_data_says_so(audit):
         "table1_values", "table3_reading", "table6_likelihood", "genetic_by_pressure",
         "genetic_joint",
     }  # fmt: skip
-    assert "proves nothing about the measured ones" in Basis.RECONSTRUCTED.caveat
+    assert "proves nothing about the measured ones" in Basis.RECONSTRUCTED.meaning
     # Tables 1, 4 and 6 are the optimum of these data by construction: only methods are judged.
     for key in resting:
         if audit[key].verdict in (Verdict.CONFIRMED, Verdict.CONTRADICTED):

@@ -139,15 +139,15 @@ def test_no_coefficients_of_the_box_come_nearer(what, signs):
         assert axis[0] - 1e-12 <= x <= axis[-1] + 1e-12
 
 
-def in_kpa(digits: int) -> dict[str, str]:
-    """Return quadratics through Table 4 in kPa, printed to some significant digits."""
-    changes = {}
-    for what in ("D", "BCD"):
+def in_table_5(digits: int, unit: float = 1.0, whats: tuple[str, ...] = tuple(NAMES)):
+    """Print Table 5 as the quadratics through Table 4, pressure in units of so many psi."""
+    changes = {"Table 5: b0": "1.55400000"}
+    for what in whats:
         pressures, wanted = targets(PUBLISHED, what)
-        c = np.linalg.solve(np.vander(6.894757 * pressures, 3, increasing=True), wanted)
+        c = np.linalg.solve(np.vander(pressures / unit, 3, increasing=True), wanted)
         for name, value in zip(NAMES[what], c, strict=True):
             changes[f"Table 5: {name}"] = f"{value:.{digits - 1}e}"
-    return changes
+    return altered(changes)
 
 
 def test_the_declared_unit_is_corrected():
@@ -160,7 +160,7 @@ def test_the_declared_unit_is_corrected():
 
 
 def test_a_table_in_kPa_is_confirmed():
-    found = pressure_unit(altered(in_kpa(5)))
+    found = pressure_unit(in_table_5(5, 1.0 / 6.894757, ("D", "BCD")))
     assert found.verdict is Verdict.CONFIRMED
     assert "In kPa" in found.evidence
 
@@ -261,18 +261,6 @@ def rounded(published):
     return {f.key: f for f in rounding_findings(published, study_rounding(published, 31))}
 
 
-def with_digits(n: int):
-    """Return Table 5 as the quadratics through Table 4, printed to many digits."""
-    changes = {"Table 5: b0": "1.55400000"}
-    for what, names in NAMES.items():
-        pressures, wanted = targets(PUBLISHED, what)
-        c = np.linalg.solve(np.vander(pressures, 3, increasing=True), wanted)
-        changes |= {
-            f"Table 5: {name}": f"{value:.{n - 1}e}" for name, value in zip(names, c, strict=True)
-        }
-    return altered(changes)
-
-
 def test_D_at_42_psi_by_hand():
     found = {q.name: q for q in rounded(PUBLISHED)["table5_digits_of_D"].found}["D at 42 psi"]
     assert found.value == pytest.approx(3.272 - 0.107 * 42 + 0.001 * 42**2)
@@ -283,7 +271,7 @@ def test_D_at_42_psi_by_hand():
 
 
 def test_with_more_digits_the_verdicts_change():
-    found = rounded(with_digits(9))
+    found = rounded(in_table_5(9))
     assert found["table5_digits_of_D"].verdict is Verdict.CONFIRMED
     assert found["table5_digits_of_BCD_and_E"].verdict is Verdict.CONFIRMED
     assert found["table5_digits_of_pull"].verdict is Verdict.CONFIRMED

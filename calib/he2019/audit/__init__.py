@@ -147,7 +147,7 @@ def audit_document(audit: Audit) -> dict[str, Any]:
         "findings": [
             asdict(f) | {
                 "found": [finite(asdict(q)) for q in f.found],
-                "depends_on_reconstruction": f.reconstructed, "caveat": f.basis.caveat,
+                "depends_on_reconstruction": f.reconstructed, "caveat": f.basis.meaning,
             }
             for f in audit.findings
         ],

@@ -25,16 +25,20 @@ def percent(fraction: float, digits: int = 3) -> str:
     return f"{format_number(100.0 * fraction, digits)} %"
 
 
-class Verdict(StrEnum):
-    """What a test says of a published figure, and one sentence on what that means."""
+class _Explained(StrEnum):
+    """A word, and one sentence on what it means."""
 
     meaning: str
 
     def __new__(cls, value: str, meaning: str = "") -> Self:
-        """Make a word that has a meaning."""
+        """Make a word that may have a meaning."""
         self = str.__new__(cls, value)
         self._value_, self.meaning = value, meaning
         return self
+
+
+class Verdict(_Explained):
+    """What a test says of a published figure."""
 
     CONTRADICTED = "contradicted", "cannot hold together with what else is printed"
     CORRECTED = (
@@ -45,16 +49,8 @@ class Verdict(StrEnum):
     UNTESTABLE = "cannot be tested", "nothing printed decides; measured data would"
 
 
-class Basis(StrEnum):
-    """What a verdict rests on, and what a reader must not conclude from it."""
-
-    caveat: str
-
-    def __new__(cls, value: str, caveat: str = "") -> Self:
-        """Make a word that may have a caveat."""
-        self = str.__new__(cls, value)
-        self._value_, self.caveat = value, caveat
-        return self
+class Basis(_Explained):
+    """What a verdict rests on; its meaning is what a reader must not conclude from it."""
 
     PRINTED = "printed figures alone"
     SLIPS = (

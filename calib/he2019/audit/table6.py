@@ -20,6 +20,7 @@ ln zt given pgr and s shows the same on the reconstructed data, and in campaigns
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -230,8 +231,8 @@ _UNITS = {"n0": "1", "n1": "1", "k": "kPa/m^n"}
 class InverseStudy:
     """The proper likelihood beside Eq 22, on the reconstructed data.
 
-    The modified Bekker model calibrated on 18 and 42 psi, with posterior draws n0, n1 and k of
-    shape (m,), and least squares of ln zt. At the slips of the 30 psi rows, in mm: Eq 21 at Table
+    The modified Bekker model calibrated on 18 and 42 psi, with posterior `draws` of n0, n1 and
+    k, each (m,), and least squares of ln zt. At the slips of the 30 psi rows, in mm: Eq 21 at Table
     6, (n,), and draws of the mean rut, (m, n). `simulated`, (c, 3): n0, n1 and R^2 of Eq 22 in
     campaigns simulated from `direct`.
     """
@@ -239,9 +240,7 @@ class InverseStudy:
     calibration: Calibration
     direct: PointEstimate
     held_out: Table
-    n0: Array
-    n1: Array
-    k: Array
+    draws: Mapping[str, Array]
     published_30: Array
     mean_30: Array
     simulated: Array
@@ -286,7 +285,7 @@ def study_inverse(
     v = published.rut_depth.values
     each = (reported[name][:, None] for name in ("k", "n0", "n1"))
     return InverseStudy(
-        calibration, direct, held, reported["n0"], reported["n1"], reported["k"],
+        calibration, direct, held, reported,
         1000.0 * rut_depth(pressure, slip, v["k"], v["n0"], v["n1"]),
         1000.0 * rut_depth(pressure, slip, *each),
         simulate_inverse(problem, direct, generator(seed, "audit", "inverse")),
@@ -367,7 +366,7 @@ def inverse_by_likelihood(published: Published, study: InverseStudy) -> Finding:
         "table6_likelihood", verdict, found,
         campaigns=study.simulated.shape[0], direct=direct["n0"], low=low[0], middle=middle[0],
         high=high[0], missed=missed, n0=summary["n0"], printed=figures["n0"],
-        below=float(np.mean(study.n0 < figures["n0"].value)),
+        below=float(np.mean(study.draws["n0"] < figures["n0"].value)),
     )  # fmt: skip
 
 
