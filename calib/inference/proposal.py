@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -45,16 +46,23 @@ class StudentT:
 
     def squared_distance(self, t: Array) -> Array:
         """Squared Mahalanobis distance from the mean, shape (k, d) to (k,)."""
-        z = np.linalg.inv(self.cholesky) @ (t - self.mean).T
+        z = self._inverse @ (t - self.mean).T
         return np.asarray(np.einsum("dk,dk->k", z, z))
 
     def log_prob(self, t: Array) -> Array:
         """Log density, shape (k, d) to (k,)."""
+        power = 0.5 * (self.dof + self.mean.size)
+        return np.asarray(self._log_top - power * np.log1p(self.squared_distance(t) / self.dof))
+
+    @cached_property
+    def _inverse(self) -> Array:
+        return np.asarray(np.linalg.inv(self.cholesky))
+
+    @cached_property
+    def _log_top(self) -> float:
         d, dof = self.mean.size, self.dof
         constant = gammaln(0.5 * (dof + d)) - gammaln(0.5 * dof) - 0.5 * d * np.log(dof * np.pi)
-        constant -= np.log(np.diag(self.cholesky)).sum()
-        power = 0.5 * (dof + d)
-        return np.asarray(constant - power * np.log1p(self.squared_distance(t) / dof))
+        return float(constant - np.log(np.diag(self.cholesky)).sum())
 
 
 def log_sum(parts: Array) -> Array:
@@ -138,10 +146,14 @@ class TriangularMap:
         z = v[:, ::-1].copy()
         z[:, 0] += self.coefficients[0, 0]
         z[:, 1:] *= np.exp(np.outer(_bounded(z[:, 0]), self.growth[1:]))
-        features = np.ones((len(v), 1))
+        features, bounded = np.ones((len(v), len(self.coefficients))), np.empty_like(z)
         for i in range(1, z.shape[1]):
-            features = np.concatenate([features, *_own_features(z, i - 1)], axis=1)
-            z[:, i] += features @ self.coefficients[: features.shape[1], i]
+            # The features of the coordinate before this one follow those of all earlier ones.
+            first, last = 1 + (i - 1) * (i + 2) // 2, 1 + i * (i + 3) // 2
+            bounded[:, i - 1] = _bounded(z[:, i - 1])
+            features[:, first] = z[:, i - 1]
+            features[:, first + 1 : last] = bounded[:, [i - 1]] * bounded[:, :i]
+            z[:, i] += features[:, :last] @ self.coefficients[:last, i]
         return np.asarray(z[:, ::-1] * self.sd + self.mean)
 
 
@@ -155,13 +167,12 @@ def _features(z: Array) -> Array:
 
     The features of the first i coordinates come first.
     """
-    own = [part for i in range(z.shape[1]) for part in _own_features(z, i)]
-    return np.concatenate([np.ones((len(z), 1)), *own], axis=1)
-
-
-def _own_features(z: Array, i: int) -> tuple[Array, Array]:
-    bounded = _bounded(z[:, : i + 1])
-    return z[:, [i]], bounded[:, [i]] * bounded
+    d = z.shape[1]
+    features, bounded = np.ones((len(z), 1 + d * (d + 3) // 2)), _bounded(z)
+    one, other = np.tril_indices(d)
+    features[:, 1 + np.arange(d) * (np.arange(d) + 3) // 2] = z
+    features[:, 2 + one * (one + 3) // 2 + other] = bounded[:, one] * bounded[:, other]
+    return features
 
 
 def _regress(features: Array, z: Array, weight: Array, effective: float) -> Array:

@@ -291,19 +291,24 @@ def sample_density(
         starts[-1] = last_starts
     target = min(settings.steps, settings.max_steps)
     done = 0
+    segments: list[list[tuple[Array, Array]]] = [[] for _ in streams]
     while True:
-        length = target + max(16, target // 12)  # the first are not kept
-        chains, values, accepted = [], [], []
+        made = sum(len(value) for _, value in segments[0])
+        aside = 0 if made else max(16, target // 12)  # the first steps are not kept
+        length, accepted = target - made + aside, []
         for i, stream in enumerate(streams):
             moves = fitted_moves(proposal, stream)
             chain, value, fraction = run_walkers(count, starts[i], moves, length, stream)
             starts[i] = chain[-1]
-            chains.append(chain[-target:])
-            values.append(value[-target:])
+            segments[i].append((chain[aside:], value[aside:]))
             accepted.append(fraction)
             if progress is not None:
                 progress(done + (i + 1) * length, done + len(streams) * length)
         done += len(streams) * length
+        chains, values = (
+            [np.concatenate([segment[part] for segment in one]) for one in segments]
+            for part in (0, 1)
+        )
         tau = np.stack([longest_autocorrelation_time(chain) for chain in chains]).max(axis=0)
         # Fewer draws, evenly thinned, are worth less: what passes is not in doubt.
         last = np.stack(chains), np.stack(values)
@@ -315,7 +320,10 @@ def sample_density(
             report = replace(report, passed=False, reasons=(*report.reasons, what))
         if report.passed or LEAST_LONGER * target > settings.max_steps:
             break
-        target = min(_longer(target, tau, report, settings.gate), settings.max_steps)
+        had, target = target, min(_longer(target, tau, report, settings.gate), settings.max_steps)
+        if target <= 2 * had and not neglected.any():
+            continue  # the chains go on
+        segments = [[] for _ in streams]
         if neglected.any():
             proposal = proposal.extended(t[neglected])
         flat = t.reshape(-1, t.shape[-1])
