@@ -17,6 +17,7 @@ from threading import Thread
 
 import psutil
 import pytest
+from distributed import Client
 
 from calib.batch import cluster
 from calib.batch.tasks import run_tasks
@@ -214,6 +215,8 @@ def test_workers_of_other_versions_are_refused(
 ) -> None:
     ours = cluster.versions()
     monkeypatch.setattr(cluster, "versions", work.versions)
+    with Client(scheduler, set_as_default=False) as client:
+        client.wait_for_workers(1)
     with pytest.raises(CalibError, match=r"would not give the same numbers.*numpy"):
         run_tasks(work.draw, {"a": 1}, tmp_path, scheduler=scheduler)
     assert {"numpy", "scipy", "emcee", "calib source"} == set(ours)

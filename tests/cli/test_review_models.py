@@ -118,7 +118,7 @@ def test_slow_models_are_left_out_of_sbc_unless_named(
     def stop(*_: object, **__: object) -> None:
         raise CalibError("begun")
 
-    monkeypatch.setattr("calib.validation.sbc_sbc", stop)
+    monkeypatch.setattr("calib.validation.sbc.run_sbc", stop)
     told = calib("sbc", "--out", "sbc").err
     assert "begun" in told
     assert f"left out: {', '.join(SLOW)}, of which each campaign takes minutes" in told
