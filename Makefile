@@ -22,7 +22,7 @@ reference: $(READY) report
 # their assertions out takes each process six seconds.
 test: export PYTHONDONTWRITEBYTECODE :=
 test: $(READY)
-	$(BIN)/python -m pytest -n auto --dist loadgroup --no-loadscope-reorder
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest -m slow
@@ -31,7 +31,7 @@ test-slow: $(READY)
 coverage: export COVERAGE_FILE := $(CURDIR)/out/coverage/data
 coverage: $(READY)
 	rm -rf out/coverage && mkdir -p out/coverage
-	$(BIN)/python -m coverage run -m pytest -n auto --dist loadgroup --no-loadscope-reorder
+	$(BIN)/python -m coverage run -m pytest -n auto --dist loadfile
 	$(BIN)/python -m coverage combine -q
 	$(BIN)/python -m coverage report --skip-covered
 

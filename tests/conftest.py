@@ -25,7 +25,7 @@ from tests.report.figures.fixtures import (  # noqa: F401
     rut,
     unconverged,
 )
-from tests.together import pytest_collection_modifyitems  # noqa: F401
+from tests.together import pytest_collection_modifyitems, pytest_xdist_make_scheduler  # noqa: F401
 
 SEED = 2019
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -24,7 +25,7 @@ GROUPS = (
      "validation/test_scores.py",
      "validation/test_validate.py", "check/test_montecarlo.py",
      "cli/test_audit.py", "cli/test_compare.py", "cli/test_paper_gaps.py",
-     "he2019/test_audit.py", "he2019/test_regressions.py", "he2019/test_gaps.py",
+     "he2019/test_audit.py", "he2019/test_table6.py", "he2019/test_gaps.py",
      "extension/test_extension.py", "validation/test_sbc.py", "docs/test_build.py"),
     ("gap/test_ranking.py", "gap/test_mixture.py", "gap/test_files.py", "gap/test_corrected.py",
      "report/page/test_diagnosis.py", "report/figures/test_gap.py"),
@@ -43,15 +44,34 @@ GROUPS = (
 )  # fmt: skip
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Name the group of every test for `--dist loadgroup`, and put the longest groups first."""
+@cache
+def place_of(file: str) -> int:
+    """Return which group a file of the tests belongs to; their number where none."""
+    whole = (i for i, names in enumerate(GROUPS) if file.startswith(names))
+    return next(whole, len(GROUPS))
 
-    def place(item: pytest.Item) -> int:
-        file = item.path.relative_to(TESTS).as_posix()
-        return next((i for i, names in enumerate(GROUPS) if file.startswith(names)), len(GROUPS))
 
-    items.sort(key=place)
-    for item in items:
-        own = place(item) == len(GROUPS)
-        group = item.path.relative_to(TESTS).as_posix() if own else f"group {place(item)}"
-        item.add_marker(pytest.mark.xdist_group(group))
+def group_of(path: str) -> str:
+    """Return the group of a file, given from the folder of the project."""
+    file = path.removeprefix("tests/")
+    place = place_of(file)
+    return f"group {place}" if place < len(GROUPS) else file
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """Share groups out in their order; without it files, those of the most tests first."""
+    from xdist.scheduler import LoadScopeScheduling
+
+    class Groups(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return group_of(nodeid.partition("::")[0])
+
+    config.option.loadscopereorder = False
+    return Groups(config, log)
+
+
+def pytest_collection_modifyitems(config, items) -> None:
+    """Put the longest groups first in the processes that share the work."""
+    if hasattr(config, "workerinput"):
+        items.sort(key=lambda item: place_of(item.path.relative_to(TESTS).as_posix()))
