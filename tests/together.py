@@ -25,7 +25,7 @@ GROUPS = (
      "validation/test_scores.py",
      "validation/test_validate.py", "check/test_montecarlo.py",
      "cli/test_audit.py", "cli/test_compare.py", "cli/test_paper_gaps.py",
-     "he2019/test_audit.py", "he2019/test_table6.py", "he2019/test_gaps.py",
+     "he2019/test_audit.py", "he2019/test_tables_1_and_6.py", "he2019/test_gaps.py",
      "extension/test_extension.py", "validation/test_sbc.py", "docs/test_build.py"),
     ("gap/test_ranking.py", "gap/test_mixture.py", "gap/test_files.py", "gap/test_corrected.py",
      "report/page/test_diagnosis.py", "report/figures/test_gap.py"),

@@ -196,7 +196,7 @@ def _read_file(path: Path) -> CaseFile:
             f"the case cannot be read ({error.strerror})",
             where=str(path),
             hint=f"give its folder: {folder.parent}"
-            if folder.is_file()
+            if (folder.parent / "case.toml").is_file()
             else "give a folder with a case.toml in it",
         ) from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

@@ -204,8 +204,9 @@ def _unused(problem: Problem) -> dict[str, NDArray[np.str_] | Array]:
 
 
 def unused(table: Table, own: Collection[str]) -> dict[str, NDArray[np.str_] | Array]:
-    """Columns of a table, by their headers, save those by whose canonical names rows are judged."""
-    known = {table.header_of(n): values for n, values in table.columns.items() if n not in own}
+    """Columns of a table as the file has them, save those whose canonical names are in `own`."""
+    rest = {n: values for n, values in table.columns.items() if n not in own}
+    known = {header: np.asarray(values) for header, values in table.as_in_file(rest).items()}
     # A label's numbers are codes.
     for name in (n for n in table if n in QUANTITIES and QUANTITIES[n].kind == "label"):
         header = table.header_of(name)
