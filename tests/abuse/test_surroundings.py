@@ -421,6 +421,7 @@ def numbers() -> dict[str, Any]:
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_errors_that_a_caller_asks_numpy_for_change_nothing() -> None:
     write_case(make_case("force_offset", models=PULL_ONLY, n_lab=15, n_field=12), Path("case"))
     usual = numbers()

@@ -249,6 +249,7 @@ def test_equations_are_read_from_their_latex() -> None:
     assert "<msub><mi>x</mi><mn>1</mn></msub>" in equation(model.latex, model.numbers)
 
 
+@pytest.mark.slow
 def test_a_model_of_lambdas_is_reported_on_two_processes(run: Calib) -> None:
     """Its functions cannot be pickled, and its server was started before the model was known."""
     with pool(2) as before:

@@ -64,6 +64,7 @@ def agree(found: Calibration, truth: Calibration, mean: float = 0.05, sd: float 
         assert abs(e.sd / s.sd - 1.0) < sd, name
 
 
+@pytest.mark.slow
 def test_few_runs_give_the_posterior_of_three_hundred_thousand() -> None:
     data = table()
     declared(pull, "slow", emulate=True)
@@ -78,6 +79,7 @@ def test_few_runs_give_the_posterior_of_three_hundred_thousand() -> None:
     agree(found, directly())
 
 
+@pytest.mark.slow
 def test_a_budget_that_is_too_small_is_told() -> None:
     declared(lambda t, x: pull(t, x) * np.cos(25.0 * t[:, :1]), "wild", emulate=True, runs=30)
     emulation = calib.emulated(calib.build_problem("wild", table()), seed=1)
