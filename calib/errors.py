@@ -60,7 +60,7 @@ class CalibError(Exception):
 
 
 def meant(name: str, known: Iterable[str], otherwise: str = "correct the name") -> str:
-    """Ask whether known names that hold a name, or else the one most like it, were meant.
+    """Suggest known names that contain a name, or else the most similar one.
 
     Parameters
     ----------

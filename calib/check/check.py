@@ -454,7 +454,7 @@ def _verify_tables(
 
 
 def _verify_gaps(folder: Path, summary: Mapping[str, Any], *, same_code: bool) -> list[Item]:
-    """Hold what a summary says of the source's gaps, and their corrected models, against diagnoses.
+    """Check a summary's statements on the paper's gaps against the diagnoses and corrected models.
 
     Another version than the one that wrote the report may predict otherwise.
     """

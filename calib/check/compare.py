@@ -429,7 +429,7 @@ def _unread(name: str, error: Exception) -> Item:
 
 
 def _verify_summary(name: str, file: DrawsFile, stated: Mapping[str, Any]) -> Item:
-    """Check that a file's draws have the summary that is stated of them."""
+    """Check that the stated summary is that of the draws in the file."""
     for parameter, values in summary_of(file).items():
         for key, value in values.items():
             given, size = inside(stated, parameter).get(key), _ROUNDED * values["sd"]

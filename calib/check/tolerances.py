@@ -141,7 +141,7 @@ type Of = Literal[
 
 @dataclass(frozen=True)
 class Tolerance:
-    """What is taken for the same, of entries of a kind that the module's docstring names.
+    """The tolerance of one kind of entry; the module's docstring names the kinds.
 
     At most a `part` of the natural scale that it is `of`, and a `floor` in the entry's own unit.
     Text may differ in its numbers if `words`; more is called a difference if `judged`.

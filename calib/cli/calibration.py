@@ -505,7 +505,7 @@ def _cell(cell: Any, empty: str = "nan") -> str:
 
 
 def _numbers(columns: Mapping[str, Any]) -> dict[str, list[float | str]]:
-    """Return columns whose cells, which may be the user's own text, are numbers where they can."""
+    """Return columns with their cells as numbers where possible; text of the user stays text."""
 
     def number(cell: Any) -> float | str:
         try:

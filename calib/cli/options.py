@@ -74,7 +74,7 @@ Simulators = Annotated[
 
 
 class _Aside(io.TextIOBase):
-    """An output that forgets words for people, before the one that a program reads."""
+    """A standard output that discards text, so that only the JSON document is printed."""
 
     def __init__(self, output: TextIO) -> None:
         self.output = output

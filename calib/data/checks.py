@@ -130,7 +130,7 @@ def _another_unit(table: Table, name: str, found: str) -> CalibError:
 
 
 def fits_load(pull: float, load: float) -> bool:
-    """Whether a largest pull can be that of a wheel under a load, of one unit: a part of it."""
+    """Whether a largest pull is plausible for a wheel under a load in the same unit."""
     return 0.01 * load < pull < 3.0 * load
 
 

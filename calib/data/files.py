@@ -180,7 +180,7 @@ def _format(values: ArrayLike | Sequence[str]) -> list[str]:
 
 
 # Of a file that is not valid TOML.
-MEND_TOML = "correct that line; names with other characters than A-Z a-z 0-9 _ - stand in quotes"
+TOML_HINT = "correct that line; names with other characters than A-Z a-z 0-9 _ - stand in quotes"
 
 
 def decoded(raw: bytes, errors: str = "strict") -> str:
@@ -200,7 +200,7 @@ def decoded(raw: bytes, errors: str = "strict") -> str:
 
 
 def writable(name: str) -> str:
-    """Return a name of a file that may be in no encoding as one that a text can hold."""
+    """Return a file name as printable text, even if it is not valid in any encoding."""
     return name.encode("utf-8", "backslashreplace").decode()
 
 

@@ -51,7 +51,7 @@ class KnownData:
     holds: Callable[[Table], bool]
 
     def register(self) -> None:
-        """Have it recognised."""
+        """Register it."""
         KNOWN_DATA.add(self)
 
 

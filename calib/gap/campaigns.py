@@ -168,7 +168,7 @@ class CaseSimulator:
 
 
 def _even(column: str, values: Array) -> Array:
-    """A condition on the scale on which what depends on it is even."""
+    """Return a condition on its natural scale: the logarithm of a factor."""
     if column in QUANTITIES and QUANTITIES[column].of_factors:
         return np.asarray(np.log(np.maximum(values, 1e-6)))
     return values

@@ -33,7 +33,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from calib.data import Table, read_table
-from calib.data.files import MEND_TOML, read_text, read_toml
+from calib.data.files import TOML_HINT, read_text, read_toml
 from calib.data.quantities import OUTPUTS, output_of
 from calib.data.reader import common_label
 from calib.data.table import MAX_TEXT_ROWS, parse_header
@@ -56,7 +56,7 @@ class Size(_Strict):
 
 
 class Context(_Strict):
-    """What is known of a case besides its data.
+    """What is known of a case beyond its data.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ class Case:
     notes : tuple of str
         What a reader must know about the origin of the data.
     context : Context
-        What is known besides the data.
+        What is known beyond the data.
     priors : mapping of str to DeclaredPriors
         By output, in the place of the model's own.
     covariates : mapping of str to tuple of str
@@ -200,7 +200,7 @@ def _read_file(path: Path) -> CaseFile:
             else "give a folder with a case.toml in it",
         ) from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CalibError(f"not valid TOML: {error}", where=str(path), hint=MEND_TOML) from None
+        raise CalibError(f"not valid TOML: {error}", where=str(path), hint=TOML_HINT) from None
     keys = list(CaseFile.model_fields)
     if unknown := [key for key in content if key not in keys]:
         raise CalibError(

@@ -404,7 +404,7 @@ def _mean_sd(draws: Array) -> tuple[float, float]:
 
 
 def _untested(found: Diagnosis) -> Iterator[doc.Untested]:
-    """Find listed effects on the outputs of what acts that a missing column hides, also in part."""
+    """Find listed effects on the affected outputs that a missing column hides, even in part."""
     acting = {n for n, c in found.inclusion.causes.items() if c.probability >= 0.5}
     known, view = _effects(found), found.data.view
     touched = {role for n in acting & set(known) for role in known[n].outputs}

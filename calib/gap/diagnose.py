@@ -73,7 +73,7 @@ class Diagnosis:
         To predict at other conditions.
     seed : int
     inclusion : Inclusion
-        Which causes act, whatever acts besides, and their shares of the gap.
+        Which causes act, whatever else acts, and their shares of the gap.
     without_context : mapping of str to float, optional
         How probable each cause is to act without what the case's context put in; ``none`` and
         ``unknown`` (something unlisted) among them. None without a context.
@@ -326,7 +326,7 @@ def verdict(probability: Mapping[str, float]) -> str:
     """Name the outcome.
 
     ``none`` and ``unknown``, which is nothing but unlisted, where they are at least `NAMED`
-    probable; ``effect`` where some listed cause acts so probably, whatever acts besides; else
+    probable; ``effect`` where some listed cause acts so probably, whatever else acts; else
     ``ambiguous``.
     """
     for name in ("none", "unknown"):

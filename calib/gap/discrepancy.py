@@ -1,4 +1,4 @@
-"""How the field may differ besides by effects: parameter shifts and free discrepancies."""
+"""Differences of the field other than effects: parameter shifts and free discrepancies."""
 
 from __future__ import annotations
 

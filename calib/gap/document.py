@@ -409,7 +409,7 @@ class GapDocument:
     assumed : mapping of str to float
         Conditions that the calibration does not record, as the best explanation takes them.
     put_in, suspected, excluded, without_context
-        What was put in besides the data, in words; causes suspected or sized; causes excluded; and
+        What was put in beyond the data, in words; causes suspected or sized; causes excluded; and
         the probabilities of causes without all that.
     doubts : tuple of str
         What the most probable explanation should not leave in the field, each a clause.

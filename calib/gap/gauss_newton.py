@@ -392,7 +392,7 @@ def _advance(batch: Batch) -> None:
 
 
 def _end_beside_modes(batch: Batch, slope: Slope) -> None:
-    """Leave iterates that are beside their modes one more step."""
+    """Allow one more step to iterates that are close to their modes."""
     if all(a.steps <= FIRST_STEPS for a in batch.iterates):
         return
     left = _left_to_gain(batch, slope)

@@ -309,7 +309,7 @@ def _varies(data: Campaigns, over: str) -> bool:
 
 
 def with_residual_discrepancy(data: Campaigns, causes: Hypothesis) -> list[Hypothesis]:
-    """Listed causes, or a shift, and besides them something that is not listed."""
+    """Listed causes, or a parameter shift, together with something that is not listed."""
     overs: list[tuple[SmoothOver, float]] = [("level", SMOOTHS[0])]
     overs += [("all", size) for size in SMOOTHS]
     if data.view.column("slip") is not None:
@@ -328,7 +328,7 @@ def with_residual_discrepancy(data: Campaigns, causes: Hypothesis) -> list[Hypot
 
 
 def resized(causes: Hypothesis, usual: Mapping[str, Priors], large: Collection[str]) -> Hypothesis:
-    """Return effects of which some may be several times as large as priors say, the others not."""
+    """Return a hypothesis with widened size priors for some of its effects."""
     names = [e.name for e in causes.effects]
     were = sum(p != usual[n] for n, p in zip(names, causes.effect_priors, strict=True))
     priors = tuple(_wide(usual[n]) if n in large else usual[n] for n in names)

@@ -10,11 +10,11 @@ Restricting its prior to relevant sizes multiplies its evidence by
 both estimated from draws. It keeps the probability of `none` from being shared out among effects
 too small to see, and that of one effect among pairs whose other half is idle.
 
-No formula is right to the last: besides the form errors that a hypothesis has, some shape of a real
-gap stays that nothing explains. Of a small gap it is a part of its size, lost in the noise; of a
-large one form errors, whose freedom grows with the gap, take up what is beyond half a noise sd or
-so. Evidence that reckons with the noise alone would be surer than the data are. So posterior
-probabilities p become p^(1/T), renormalised,
+No formula is exact: even with its form errors, a hypothesis leaves some part of a real gap
+unexplained. If the gap is small, that part is lost in the noise. If it is large, the form errors,
+whose freedom grows with the gap, absorb what exceeds about half a noise sd. Evidence that allowed
+for the noise alone would be overconfident. So posterior probabilities p become p^(1/T),
+renormalised,
 
     T = 1 + min(0.08 g, 0.6)^2,
 

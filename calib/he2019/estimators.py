@@ -32,7 +32,7 @@ from calib.models.base import Array
 
 
 class Features(NamedTuple):
-    """What the geometric method reads off a curve of pull (kN) against slip (%).
+    """The features that the geometric method reads off a curve of pull (kN) against slip (%).
 
     Initial slope tan(theta) (kN/%), slip and pull of the peak xm and ym, pull at the largest slips
     ys. Features are counted from `zero`, the slip at which the pull is zero; `has_peak` says

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from scipy.special import digamma, polygamma
 
 from calib.batch.user_code import declared_in
-from calib.data.files import MEND_TOML, read_text
+from calib.data.files import TOML_HINT, read_text
 from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError, in_words, meant
 from calib.inference.likelihood import DEFAULT_PRIORS, USUAL, Along, Family, NoiseChoice
@@ -345,7 +345,7 @@ def _content(text: str, source: str) -> dict[str, Any]:
         return _parsed(text)
     except tomllib.TOMLDecodeError as error:
         found = f"the prior file is not valid TOML: {error}"
-        raise CalibError(found, where=source, hint=MEND_TOML) from None
+        raise CalibError(found, where=source, hint=TOML_HINT) from None
 
 
 @lru_cache(maxsize=64)

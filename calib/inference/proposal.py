@@ -308,7 +308,7 @@ class Proposal:
         return np.log(self.weights)[:, None] + np.stack([part.log_prob(t) for part in self.parts])
 
     def extended(self, t: Array) -> Proposal:
-        """Return the proposal with one more part, about draws (k, d) that lie beside the others."""
+        """Return the proposal with one more part, fitted to draws (k, d) that the others miss."""
         found = moments(t, np.full(len(t), 1.0 / len(t)))
         if found is None:
             return self
@@ -353,7 +353,7 @@ class Guess(NamedTuple):
 
 
 class Assessment(NamedTuple):
-    """What importance sampling from a proposal says of it and of the density.
+    """The evidence of a density and the efficiency of a proposal, by importance sampling.
 
     The log of the density's integral, and the effective fraction of the draws, in (0, 1]; zero if
     the density was zero at all of them.

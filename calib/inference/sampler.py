@@ -3,7 +3,7 @@
 Walkers mix independent draws from a proposal fitted to the posterior with differential evolution
 (ter Braak 2006, doi:10.1007/s11222-006-8769-1); the proposal is fitted again between attempts. The
 last ensemble starts from draws that sequential Monte Carlo carried from the prior to the posterior
-and that know of no optimum, so that what it ends in checks the search for modes.
+and independently of any optimum, so it checks the search for modes.
 """
 
 from __future__ import annotations

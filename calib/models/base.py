@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.batch.user_code import call
-from calib.data.files import MEND_TOML
+from calib.data.files import TOML_HINT
 from calib.data.quantities import OUTPUTS, QUANTITIES, convert, real_array
 from calib.errors import CalibError
 
@@ -436,7 +436,7 @@ def _check_priors(model: Model) -> None:
     try:
         given = tomllib.loads(model.priors).get("parameters", {})
     except tomllib.TOMLDecodeError as error:
-        raise CalibError(f"its priors are not valid TOML: {error}", hint=MEND_TOML) from None
+        raise CalibError(f"its priors are not valid TOML: {error}", hint=TOML_HINT) from None
     names = (*model.parameters, "sigma")
     apart = sorted(set(names) ^ set(given))
     if apart:

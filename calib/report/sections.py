@@ -31,7 +31,7 @@ type Document = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Target:
-    """Where a section writes its files, and how.
+    """Where and how a section writes its files.
 
     Parameters
     ----------

@@ -25,7 +25,7 @@ from calib.batch.campaign.kinds import KINDS
 from calib.batch.environment import sha256, versions
 from calib.batch.folders import check_folder, check_room, write_whole, writing
 from calib.batch.tasks import check_names, failed_tasks, run_tasks
-from calib.data.files import MEND_TOML, decoded
+from calib.data.files import TOML_HINT, decoded
 from calib.errors import CalibError
 from calib.inference.random import stream
 from calib.report.numbers import finite
@@ -122,7 +122,7 @@ def _read(path: Path) -> tuple[bytes, dict[str, Any]]:
             hint="give the path of a TOML file",
         ) from None
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise CalibError(f"not valid TOML: {error}", where=str(path), hint=MEND_TOML) from None
+        raise CalibError(f"not valid TOML: {error}", where=str(path), hint=TOML_HINT) from None
 
 
 def _tables(found: Any, name: str, path: Path) -> list[Any]:

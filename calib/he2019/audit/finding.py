@@ -132,12 +132,12 @@ class Finding:
 
 
 def consistent_if(possible: bool) -> Verdict:
-    """Return what it says of a figure that it passes, or fails, a test that it could fail."""
+    """Return the verdict on a figure by whether the other printed figures allow it."""
     return Verdict.CONSISTENT if possible else Verdict.CONTRADICTED
 
 
 def beside_rival(read: bool, rival: bool) -> Verdict:
-    """Return what it says of a reading that it, or its rival, passes a test."""
+    """Return the verdict on a reading by whether it and its rival pass a test."""
     if read:
         return Verdict.CONSISTENT if rival else Verdict.CONFIRMED
     return Verdict.CORRECTED if rival else Verdict.CONTRADICTED

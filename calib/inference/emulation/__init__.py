@@ -320,8 +320,8 @@ def _compared(state: State, off: Array, rest: Array, variances: Array) -> HeldOu
     rows = state.emulator.curves_at(state.problem.conditions)[:, 1:]
     errors = off @ rows.T
     total = np.square(errors).sum(axis=1) + np.square(rest).mean(axis=1) * len(rows)
-    # A run of a simulator with noise of its own has that besides, no error of the emulator: in each
-    # of the coefficients, as the curves are orthonormal, and in what these do not hold.
+    # The noise of a stochastic simulator is no error of the emulator. It is in each coefficient,
+    # the curves being orthonormal, and in the part that the curves leave out.
     own = state.own_noise**2
     left = 1.0 - rows.shape[1] / rest.shape[1]
     squared = max(float(total.mean()) - own * (np.square(rows).sum() + left * len(rows)), 0.0)

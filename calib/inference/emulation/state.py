@@ -270,7 +270,7 @@ class State:
         return self._made(theta, self.nodes, replicate)
 
     def _without_across(self, theta: Array) -> Array | None:
-        """Return the values of a run (d,) that failed, made again but for nodes across zero.
+        """Return the values (d,) of a failed run, repeated without the nodes across zero.
 
         None if it fails there too, or failed by chance.
         """

@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from calib.batch.user_code import load, run_file
-from calib.data.files import MEND_TOML, read_text, read_toml
+from calib.data.files import TOML_HINT, read_text, read_toml
 from calib.data.quantities import QUANTITIES
 from calib.data.registry import Registry, run_again
 from calib.data.table import parse_header
@@ -302,7 +302,7 @@ def from_callable(
         tables = tomllib.loads(parameters).get("parameters", {})
     except tomllib.TOMLDecodeError as error:
         raise CalibError(
-            f"the priors are not valid TOML: {error}", where=f"simulator {name}", hint=MEND_TOML
+            f"the priors are not valid TOML: {error}", where=f"simulator {name}", hint=TOML_HINT
         ) from None
     return declare(
         name or getattr(f, "__name__", "simulator"),
@@ -514,7 +514,7 @@ def _declared(path: Path) -> Simulated:
     except ValidationError as error:  # which is a ValueError
         raise _explained(error) from None
     except ValueError as error:
-        raise CalibError(f"not valid TOML: {error}", hint=MEND_TOML) from None
+        raise CalibError(f"not valid TOML: {error}", hint=TOML_HINT) from None
     made_of = tuple(
         hashlib.sha256(_content(path.parent / name, "files", f"file {name!r}")).hexdigest()
         for name in file.files

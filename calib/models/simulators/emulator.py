@@ -243,7 +243,7 @@ class Emulator:
 
 
 def _basis(near: Array, all_values: Array, negligible: float) -> tuple[Array, Array]:
-    """Return mean and orthonormal curves: first what near runs need, then what the others do."""
+    """Return mean and orthonormal curves: first those that near runs need, then the rest."""
     mean = near.mean(axis=0)
     curves = np.zeros((0, mean.size))
     for values, left in zip((near, all_values), LEFT_OUT, strict=True):
