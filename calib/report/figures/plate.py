@@ -43,12 +43,11 @@ def draw_all(drawings: Mapping[str, Callable[[], Plate | None]]) -> list[Plate]:
 
 
 def mark(figure: Figure, label: str) -> None:
-    """Write on a figure what its data are, if they have a label."""
+    """Write in a strip below a figure what its data are, if they have a label."""
     if label:
-        figure.text(
-            0.995, 0.005, f"{label.capitalize()} data", ha="right", va="bottom", fontsize=7,
-            color="0.35",
-        )  # fmt: skip
+        below = -0.02 / figure.get_figheight()
+        text = f"{label.capitalize()} data"
+        figure.text(0.995, below, text, ha="right", va="top", fontsize=7, color="0.35")
 
 
 def marked(plates: Sequence[Plate], label: str) -> list[Plate]:

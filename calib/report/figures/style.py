@@ -16,6 +16,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -147,7 +148,7 @@ def legend_below(figure: Figure, handles: Mapping[str, Any], ncols: int) -> None
     """Put one legend for all panels at the foot of a figure; leave about 4 mm a row for it."""
     figure.legend(
         list(handles.values()), list(handles), loc="lower center", ncols=ncols, borderaxespad=0.2,
-        columnspacing=1.4, labelspacing=0.3,
+        columnspacing=1.4, labelspacing=0.3, bbox_to_anchor=(0.5, 0.0),
     )  # fmt: skip
 
 
@@ -186,6 +187,10 @@ def pdf_bytes(figure: Figure) -> bytes:
 def _saved(figure: Figure, **form: Any) -> bytes:
     """Return a figure as a file of some form, drawn in the project's style."""
     content = io.BytesIO()
+    if any(text.get_position()[1] < 0.0 for text in figure.texts):
+        # The mark of its data stands in a strip below it, where it meets no label.
+        width, height = figure.get_size_inches()
+        form |= {"bbox_inches": Bbox([[0.0, -4.0 * _MM], [width, height]]), "pad_inches": 0.0}
     with style():
         figure.savefig(content, **form)
     return content.getvalue()
