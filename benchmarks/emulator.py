@@ -129,7 +129,11 @@ def ways(
     simulator = SIMULATED["slow"].simulator
 
     def ours(sequential: bool) -> tuple[Problem, dict[str, float]]:
-        settings = EmulationSettings(runs=runs, sequential=sequential)
+        settings = (
+            EmulationSettings(runs=runs)
+            if sequential
+            else EmulationSettings(runs=runs, first=runs, checks=0)
+        )
         found = emulate(problem, RunKeeper(simulator), seed, settings=settings)
         said = {"runs": float(len(found.runs)), "expected": found.expected}
         if found.held_out is not None:
@@ -138,7 +142,7 @@ def ways(
 
     return {
         "sequential": lambda: ours(True),
-        "Latin hypercube": lambda: ours(False),
+        "one design": lambda: ours(False),
         "scikit-learn, Latin hypercube": lambda: (
             peer(problem, RunKeeper(simulator), runs, seed), {"runs": float(runs)},
         ),

@@ -198,7 +198,7 @@ def throughput(rows: int, repeats: int, *, distinct: int | None = None) -> dict[
     problem = problem_of(rows, distinct=distinct)
     k = max(4, min(MOST_VECTORS, CELLS // rows))
     t = vectors_about_the_truth(problem, k)
-    n_distinct = problem.squares.n_distinct
+    n_distinct = problem.squares.mean.size
     # The data arranged, the first call, which allocates the workspace that later ones reuse.
     tracemalloc.start()
     problem.log_prob(t)

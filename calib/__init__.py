@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     from calib.inference.problem import Problem, build_problem
     from calib.inference.sampler import SamplerSettings
     from calib.models import MODELS, Model
-    from calib.models.simulators.declaration import from_callable, read_simulator
+    from calib.models.simulators.declaration import from_callable
+    from calib.models.simulators.files import read_simulator
     from calib.report.gap_words import gap_verdict
     from calib.report.verdict import Verdict, verdict
     from calib.validation.prediction import Prediction, predict
@@ -55,7 +56,8 @@ _HOME = {
     "calib.inference.problem": "Problem build_problem",
     "calib.inference.sampler": "SamplerSettings",
     "calib.models": "MODELS Model",
-    "calib.models.simulators.declaration": "from_callable read_simulator",
+    "calib.models.simulators.declaration": "from_callable",
+    "calib.models.simulators.files": "read_simulator",
     "calib.report.gap_words": "gap_verdict",
     "calib.report.verdict": "Verdict verdict",
     "calib.validation.comparison": "Comparison compare",

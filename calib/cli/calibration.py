@@ -451,7 +451,7 @@ def _predict_corrected(
     from calib.gap.corrected import conditions_outside, load_corrected, predict_columns
     from calib.gap.effects import EFFECTS
     from calib.gap.effects.user import load_effects
-    from calib.models.simulators.declaration import load_files
+    from calib.models.simulators.files import load_files
 
     load_files(sorted((run / "emulators").glob("*.npz")))
     own = {} if effects is None else load_effects(effects)

@@ -58,7 +58,7 @@ def check(
 def _checked(folder: Path, quick: bool, workers: int, effects: Path | None = None) -> Outcome:
     from calib.batch.pool import pool
     from calib.check.check import check as check_folder
-    from calib.models.simulators.declaration import load_files
+    from calib.models.simulators.files import load_files
 
     # A slow simulator is checked as it was emulated: nothing is run.
     load_files(sorted((folder / "emulators").glob("*.npz")))

@@ -99,7 +99,8 @@ def prepare_case(case: Case, run: Path | None, seed: int, workers: int) -> list[
     from calib.data.quantities import OUTPUTS
     from calib.gap.campaigns import campaigns
     from calib.inference.emulation.prepared import prepare, prepare_field, reaches
-    from calib.models.simulators.declaration import load_files, simulated_by
+    from calib.models.simulators.declaration import simulated_by
+    from calib.models.simulators.files import load_files
 
     if run is None and not any(map(simulated_by, case.models.values())):
         return []

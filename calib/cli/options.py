@@ -48,7 +48,7 @@ Scheduler = Annotated[
 def _load(paths: list[Path] | None) -> list[Path] | None:
     """Register what the files declare, before names are looked up."""
     if paths:
-        from calib.models.simulators.declaration import load_files
+        from calib.models.simulators.files import load_files
 
         load_files(paths)
     return paths

@@ -386,7 +386,7 @@ def _output(case: Case, name: str, model: str) -> OutputData:
         table.must_have(*get_model(model).conditions)
     lab = case.lab.take(np.isfinite(case.lab[column]))
     problem = build_problem(model, lab, case.priors.get(name))
-    problem.noise.must_be_usual(problem.priors.source, "a diagnosis")
+    problem.noise.must_be_iid_normal(problem.priors.source, "a diagnosis")
     rows = np.flatnonzero(np.isfinite(case.field[column]))
     _check_field(case, name, column, rows)
     response = problem.bound.to_response(case.field[column][rows])

@@ -335,7 +335,7 @@ def case_from_run(run: Path, field: Path) -> Case:
     """
     # Needs what writes and reads run folders, and that a sampler: no other case does.
     problem = import_module("calib.inference.io").load_calibration(run).problem
-    problem.noise.must_be_usual(str(Path(run) / "priors.toml"), "a diagnosis")
+    problem.noise.must_be_iid_normal(str(Path(run) / "priors.toml"), "a diagnosis")
     model = problem.bound.model
     output = output_of(model.output)
     table = read_table(field, allow_missing=tuple(OUTPUTS.values()))

@@ -2,8 +2,7 @@
 
 # Likelihood
 HALF_LN_2PI = 0.9189385332046727  # nats; of a normal density; test_likelihood
-TILE_CELLS = 65_536  # rows times vectors; a few arrays in cache; test_likelihood
-CHUNK_CELLS = 200_000  # rows times vectors; bounds the memory; test_problem
+CHUNK_CELLS = 200_000  # rows times vectors; bounds the memory; test_likelihood
 
 # Search for modes
 MODE_STARTS = 64  # points; finds modes of a tenth of the prior's width; test_modes

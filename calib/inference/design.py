@@ -23,20 +23,17 @@ if TYPE_CHECKING:
     from calib.models.simulators.simulator import Simulator
 
 
-def prior_design(problem: Problem, count: int, seed: int, *, latin: bool = False) -> Array:
+def prior_design(problem: Problem, count: int, seed: int) -> Array:
     """Return natural parameters of the model spread over the prior, shape (count, d).
 
-    By Sobol's sequence, of which every beginning is even, or a Latin hypercube.
+    By Sobol's sequence, of which every beginning is even.
     """
     from scipy.stats import qmc  # late: half a second, and few commands emulate
 
     d = len(problem.priors.free)
     bits = int(np.ceil(np.log2(max(count, 2))))
     rng = generator(seed, "emulate", "design")
-    if latin:
-        u = qmc.LatinHypercube(d, rng=rng).random(count)
-    else:
-        u = qmc.Sobol(d, scramble=True, rng=rng).random_base2(bits)[:count]
+    u = qmc.Sobol(d, scramble=True, rng=rng).random_base2(bits)[:count]
     t = problem.priors.ppf(0.002 + 0.996 * u)  # without the outermost tails
     return problem.of_model(problem.theta(t))
 

@@ -48,7 +48,6 @@ from calib.inference.search import (
     fit_identified,
     prior_location,
     representative_rows,
-    residuals,
     search_in_box,
     sum_of_squares,
 )
@@ -254,14 +253,14 @@ class _Descent:
         return self.problem.theta(self.location + z * self.width)
 
     def residuals(self, z: Array) -> Array:
-        return np.asarray(residuals(self.problem, self.natural(z[None]))[0] / self.scale)
+        return np.asarray(self.problem.residuals(self.natural(z[None]))[0] / self.scale)
 
     def jacobian(self, z: Array) -> Array:
         # All differences in one model evaluation; one-sided on a bound.
         step = 1e-5 * np.eye(z.size)  # prior standard deviations
         ahead, behind = np.minimum(z + step, self.upper), np.maximum(z - step, self.lower)
         span = np.diagonal(ahead) - np.diagonal(behind)
-        r = residuals(self.problem, self.natural(np.concatenate([ahead, behind])))
+        r = self.problem.residuals(self.natural(np.concatenate([ahead, behind])))
         slope = (r[: z.size] - r[z.size :]) / (self.scale * span[:, None])
         # A step beyond where the model has a value says nothing about that direction.
         return np.asarray(np.nan_to_num(slope, nan=0.0, posinf=0.0, neginf=0.0).T)

@@ -5,8 +5,7 @@ rows with mean m_y,
 
     sum (y - mu)^2 = sum (y - m_y)^2 + m (m_y - mu)^2,
 
-so the model is evaluated once per distinct condition. What is left is worked through in tiles, some
-rows times some vectors, that stay in the processor's cache and bound the memory.
+so the model is evaluated once per distinct condition.
 
 The density where the prediction is known with an error, a few curves B, (n, j), times independent
 normals of one variance v. Residuals r are normal with the covariance sigma^2 I + v B B'. With
@@ -31,8 +30,8 @@ sigma.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -42,8 +41,15 @@ from scipy.special import gammaln, ndtr, ndtri, stdtr, stdtrit
 from calib.data import Table
 from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
-from calib.inference.constants import HALF_LN_2PI, TILE_CELLS
+from calib.inference.constants import CHUNK_CELLS, HALF_LN_2PI
 from calib.models.base import Array, BoundModel, Conditions
+
+
+def in_chunks(function: Callable[[Array], Array], vectors: Array, n_rows: int) -> Array:
+    """Apply a function of parameter vectors (k, d) to a few at a time, to bound the memory."""
+    at_once = max(1, CHUNK_CELLS // n_rows)
+    parts = range(0, max(len(vectors), 1), at_once)
+    return np.concatenate([function(vectors[i : i + at_once]) for i in parts])
 
 
 @dataclass(frozen=True)
@@ -52,49 +58,38 @@ class SumOfSquares:
 
     Parameters
     ----------
-    tiles : tuple of (mapping of str to ndarray, ndarray, ndarray)
-        Distinct conditions in pieces, with the mean response and the number of rows at each.
-    n_distinct : int
-        Distinct conditions.
+    conditions : mapping of str to ndarray, shape (m,)
+        The distinct ones, with the mean response and the number of rows at each.
     within : float
         Sum of squares of the repeats about their means.
     """
 
     bound: BoundModel
-    tiles: tuple[tuple[Conditions, Array, Array], ...]
-    n_distinct: int
+    conditions: Conditions
+    mean: Array
+    repeats: Array
     within: float
 
     @classmethod
     def of(cls, bound: BoundModel, conditions: Conditions, response: Array) -> SumOfSquares:
         """Arrange conditions and responses (n,) for a bound model."""
-        code = np.zeros(response.size, dtype=np.intp)
-        for values in conditions.values():
-            # Renumbered at every step, so that the codes cannot overflow.
-            levels, inverse = np.unique(values, return_inverse=True)
-            code = np.unique(code * levels.size + inverse, return_inverse=True)[1]
-        _, first, code, count = np.unique(
-            code, return_index=True, return_inverse=True, return_counts=True
+        distinct, code, count = np.unique(
+            np.stack(list(conditions.values())), axis=1, return_inverse=True, return_counts=True
         )
         mean = np.bincount(code, response) / count
-        tiles = []
-        for i in range(0, count.size, TILE_CELLS):
-            some = slice(i, i + TILE_CELLS)
-            distinct = {name: v[first[some]] for name, v in conditions.items()}
-            tiles.append((distinct, mean[some], count[some].astype(np.float64)))
         within = float(np.square(response - mean[code]).sum())
-        return cls(bound, tuple(tiles), count.size, within)
+        by_name = dict(zip(conditions, distinct, strict=True))
+        return cls(bound, by_name, mean, count.astype(np.float64), within)
 
     def __call__(self, theta: Array) -> Array:
         """Evaluate natural parameters of the model, (k, d) to (k,); NaN where it has no value."""
-        total = np.full(len(theta), self.within)
+
+        def between(some: Array) -> Array:
+            predicted = self.bound.mean_response(some, self.conditions)
+            return np.asarray(np.square(predicted - self.mean) @ self.repeats)
+
         with np.errstate(all="ignore"):
-            for conditions, response, repeats in self.tiles:
-                at_once = max(1, TILE_CELLS // response.size)
-                for i in range(0, len(theta), at_once):
-                    mean = self.bound.mean_response(theta[i : i + at_once], conditions)
-                    total[i : i + at_once] += np.square(mean - response) @ repeats
-        return total
+            return self.within + in_chunks(between, theta, self.mean.size)
 
 
 def log_normal(residuals: Array, variance: Array, curves: Array, sigma: Array) -> Array:
@@ -152,65 +147,47 @@ source = "This project: weak, and as ready to fall as to grow"
 
 
 @dataclass(frozen=True)
-class NoiseChoice:
-    """What a prior file says of the noise.
+class Noise:
+    """How measurements scatter, as a prior file asks for it.
 
     It may depend on a quantity, or its canonical column; empty for one scale at all conditions. In
-    runs neighbours may be correlated; what they are counted in, or empty for independent rows.
+    runs neighbours may be correlated; what they are counted in, or empty for independent rows. On
+    data (`noise_of`), the column that the scale depends on, its mean and its sd are known too.
     """
 
     family: Family = "normal"
     depends_on: str = ""
     correlated_along: Along = ""
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of the noise's parameters beside sigma."""
-        there = {
-            "nu": self.family == "student_t", "sigma_slope": self.depends_on,
-            "rho": self.correlated_along,
-        }  # fmt: skip
-        return tuple(name for name, asked in there.items() if asked)
-
-    @property
-    def usual(self) -> bool:
-        """Whether it is normal of one standard deviation."""
-        return not self.parameters
-
-
-USUAL = NoiseChoice()
-
-
-@dataclass(frozen=True)
-class Noise:
-    """A choice of noise on some data.
-
-    Of the condition that the scale depends on, if any: its mean and sd over the calibrated rows.
-    """
-
-    choice: NoiseChoice = USUAL
     column: str = ""
     centre: float = 0.0
     spread: float = 1.0
 
     @property
-    def usual(self) -> bool:
-        """Whether it is normal of one standard deviation."""
-        return self.choice.usual
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the noise's parameters beside sigma."""
+        there = {
+            "nu": self.student, "sigma_slope": self.depends_on, "rho": self.correlated_along,
+        }  # fmt: skip
+        return tuple(name for name, asked in there.items() if asked)
 
-    def must_be_usual(self, source: str, what: str) -> None:
-        """Raise a CalibError unless usual, for what is worked out for the usual noise alone."""
-        if not self.usual:
+    @property
+    def iid_normal(self) -> bool:
+        """Whether it is independent and normal, of one standard deviation."""
+        return not self.parameters
+
+    @property
+    def student(self) -> bool:
+        """Whether it is Student's."""
+        return self.family == "student_t"
+
+    def must_be_iid_normal(self, source: str, what: str) -> None:
+        """Raise a CalibError unless it is, for what is worked out for that noise alone."""
+        if not self.iid_normal:
             raise CalibError(
                 f"{what} takes normal noise of one standard deviation only",
                 where=f"{source}, [likelihood]",
                 hint="take this table out, and fit again what was fitted with it",
             )
-
-    @property
-    def student(self) -> bool:
-        """Whether it is Student's."""
-        return self.choice.family == "student_t"
 
     def scale(self, natural: Array, conditions: Mapping[str, Array]) -> Array:
         """Return the scale at conditions: natural parameters (k, d_all) to (k, 1) or (k, n)."""
@@ -224,7 +201,7 @@ class Noise:
 
     def own(self, name: str, natural: Array) -> Array:
         """Return a parameter of the noise's own beside sigma, shape (k, 1)."""
-        names = self.choice.parameters
+        names = self.parameters
         j = natural.shape[1] - 1 - len(names) + names.index(name)
         return natural[:, j : j + 1]
 
@@ -269,25 +246,25 @@ class Noise:
         return np.asarray(-np.sign(z) * ndtri(stdtr(self.own("nu", natural), -np.abs(z))))
 
 
-NORMAL = Noise()
+IID_NORMAL = Noise()
 
 
-def noise_of(choice: NoiseChoice, conditions: Conditions, source: str) -> Noise:
-    """Return a choice of noise on the rows, (n,), that are calibrated on.
+def noise_of(noise: Noise, conditions: Conditions, source: str) -> Noise:
+    """Return a noise on the rows, (n,), that are calibrated on.
 
     Raises
     ------
     CalibError
         If the noise is to depend on what is no condition of the model, or does not vary.
     """
-    if not choice.depends_on:
-        return Noise(choice)
+    if not noise.depends_on:
+        return noise
     stems = {QUANTITIES[name].stem: name for name in conditions}
-    column = ({name: name for name in conditions} | stems).get(choice.depends_on)
+    column = ({name: name for name in conditions} | stems).get(noise.depends_on)
     where = f"{source}, [likelihood] noise_depends_on"
     if column is None:
         raise CalibError(
-            f"the noise is to depend on {choice.depends_on!r}, which is no condition of the model",
+            f"the noise is to depend on {noise.depends_on!r}, which is no condition of the model",
             where=where, expected=", ".join(stems), hint="name one of these",
         )  # fmt: skip
     values = conditions[column]
@@ -298,7 +275,7 @@ def noise_of(choice: NoiseChoice, conditions: Conditions, source: str) -> Noise:
             "that are fitted",
             where=where, expected="a condition that varies", hint="leave noise_depends_on out",
         )  # fmt: skip
-    return Noise(choice, column, float(values.mean()), spread)
+    return replace(noise, column=column, centre=float(values.mean()), spread=spread)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from calib.batch.user_code import declared_in
 from calib.data.files import TOML_HINT, read_text
 from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError, in_words, meant
-from calib.inference.likelihood import DEFAULT_PRIORS, USUAL, Along, Family, NoiseChoice
+from calib.inference.likelihood import DEFAULT_PRIORS, IID_NORMAL, Along, Family, Noise
 from calib.inference.priors import Prior, Priors
 from calib.models import MODELS
 
@@ -409,12 +409,10 @@ def _check_noise(prior: Prior, source: str) -> None:
     )  # fmt: skip
 
 
-def _noise_choice(
-    content: Mapping[str, Any], source: str, parameters: Sequence[str]
-) -> NoiseChoice:
+def _noise_choice(content: Mapping[str, Any], source: str, parameters: Sequence[str]) -> Noise:
     """Return what the table ``[likelihood]`` says."""
     if "likelihood" not in content:
-        return USUAL
+        return IID_NORMAL
     where = f"{source}, [likelihood]"
     if parameters[-1] != "sigma":
         raise CalibError(
@@ -432,7 +430,7 @@ def _noise_choice(
             'condition of the model, correlated_along = "run_order"',
             hint="correct this entry",
         ) from None  # fmt: skip
-    noise = NoiseChoice(chosen.family, chosen.noise_depends_on, chosen.correlated_along)
+    noise = Noise(chosen.family, chosen.noise_depends_on, chosen.correlated_along)
     if noise.correlated_along and noise.family != "normal":
         raise CalibError(
             "noise that is correlated along a run is normal", where=where,

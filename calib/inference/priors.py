@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.special import gammainc, gammaincinv, gammaln, log_ndtr, ndtr, ndtri, ndtri_exp
 
 from calib.errors import CalibError
-from calib.inference.likelihood import USUAL, NoiseChoice
+from calib.inference.likelihood import IID_NORMAL, Noise
 from calib.models.base import Array
 
 type Mask = NDArray[np.bool_]
@@ -85,7 +85,7 @@ class Priors:
     entries: tuple[Prior, ...]
     text: str = ""
     source: str = ""
-    noise: NoiseChoice = USUAL
+    noise: Noise = IID_NORMAL
     free: tuple[Prior, ...] = field(init=False)
 
     def __post_init__(self) -> None:

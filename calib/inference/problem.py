@@ -28,12 +28,13 @@ from calib.data.files import plain_number
 from calib.data.quantities import QUANTITIES
 from calib.data.table import accepted_headers
 from calib.errors import CalibError
-from calib.inference.constants import CHUNK_CELLS, HALF_LN_2PI
+from calib.inference.constants import HALF_LN_2PI
 from calib.inference.likelihood import (
-    NORMAL,
+    IID_NORMAL,
     Noise,
     Serial,
     SumOfSquares,
+    in_chunks,
     log_normal,
     noise_of,
     serial_of,
@@ -88,7 +89,7 @@ def check_scale(problem: Problem, assumed: Mapping[str, float]) -> None:
             "right, pass a prior file of your own that admits it (`calib priors "
             f"{problem.bound.model.name}` writes one to edit)",
         )  # fmt: skip
-    taken = ", ".join(_taken(name, value) for name, value in assumed.items())
+    taken = ", ".join(f"{QUANTITIES[n].word} {_with_unit(n, v)}" for n, v in assumed.items())
     raise CalibError(
         f"there is no column {', '.join(assumed)}; {taken} was assumed, but {found}",
         where=problem.table.source,
@@ -98,11 +99,8 @@ def check_scale(problem: Problem, assumed: Mapping[str, float]) -> None:
     )
 
 
-def _taken(name: str, value: float) -> str:
-    quantity = QUANTITIES[name]
-    return f"{quantity.word} {value:g} {quantity.unit.replace('**', '')}".removesuffix(
-        " dimensionless"
-    )
+def _with_unit(name: str, value: float) -> str:
+    return f"{value:g} {QUANTITIES[name].unit_word}".rstrip()
 
 
 def _expected(problem: Problem) -> tuple[float, float]:
@@ -150,7 +148,7 @@ class Problem:
     table: Table
     priors: Priors
     notes: tuple[str, ...] = ()
-    noise: Noise = NORMAL
+    noise: Noise = IID_NORMAL
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -182,10 +180,6 @@ class Problem:
         log = self.bound.model.response == "log"
         return -self.response if log else np.zeros_like(self.response)
 
-    @cached_property
-    def _sum_ln_jacobian(self) -> float:
-        return float(self._ln_jacobian.sum())
-
     @property
     def heavy(self) -> bool:
         """Whether a measurement has no mean: a Student-t logarithm, of whatever degrees."""
@@ -199,7 +193,7 @@ class Problem:
     @cached_property
     def serial(self) -> Serial | None:
         """The order of the rows, where their noise is correlated along it."""
-        return serial_of(self.noise.choice.correlated_along, self.table)
+        return serial_of(self.noise.correlated_along, self.table)
 
     def theta(self, t: Array) -> Array:
         """Natural parameters, sigma last, of internal ones: (k, n_dim) to (k, d_all)."""
@@ -219,7 +213,11 @@ class Problem:
 
     def residuals(self, natural: Array) -> Array:
         """Observed minus predicted on the scale of the response, shape (k, n)."""
-        return self.response - self.bound.mean_response(self.of_model(natural), self.conditions)
+
+        def observed_minus_predicted(some: Array) -> Array:
+            return self.response - self.bound.mean_response(self.of_model(some), self.conditions)
+
+        return in_chunks(observed_minus_predicted, natural, self.response.size)
 
     def draw_mean_response(
         self, natural: Array, conditions: Conditions, rng: np.random.Generator
@@ -248,37 +246,24 @@ class Problem:
 
     def log_likelihood(self, t: Array) -> Array:
         """Log likelihood of internal coordinates, shape (k,); ``-inf`` where undefined."""
-        natural = self.theta(t)
+        natural, model = self.theta(t), self.bound.model
         n, sigma = self.response.size, natural[:, -1]
         # A prior may admit sigma <= 0 or predictions beyond all bounds: they become -inf below.
         with np.errstate(all="ignore"):
-            if self.bound.model.uncertain is not None:
-                value = log_normal(*self._predicted(natural), sigma)
-            elif not self.noise.usual:
-                value = self._log_likelihood_by_row(natural)
-            else:
+            if model.uncertain is not None:
+                predicted, unknown, curves = model.uncertain(
+                    self.of_model(natural), self.conditions
+                )
+                value = log_normal(self.response - predicted, unknown, curves, sigma)
+            elif self.noise.iid_normal:
                 sse = self.squares(self.of_model(natural))
                 value = -n * (np.log(sigma) + HALF_LN_2PI) - 0.5 * sse / sigma**2
-        value += self._sum_ln_jacobian
+            else:
+                value = in_chunks(
+                    lambda some: self._log_densities(some, Serial.before).sum(axis=1), natural, n
+                )
+        value += self._ln_jacobian.sum()
         return np.where(np.isfinite(value), value, -np.inf)
-
-    def _predicted(self, natural: Array) -> tuple[Array, Array, Array]:
-        """Residuals (k, n), and the prediction's error: its variance (k,) along curves (n, j)."""
-        uncertain = self.bound.model.uncertain
-        if uncertain is None:
-            none = np.zeros(len(natural)), np.zeros((self.response.size, 0))
-            return self.residuals(natural), *none
-        location, unknown, curves = uncertain(self.of_model(natural), self.conditions)
-        return self.response - location, unknown, curves
-
-    def _log_likelihood_by_row(self, natural: Array) -> Array:
-        at_once = max(1, CHUNK_CELLS // self.response.size)
-        value = np.empty(len(natural))
-        for i in range(0, len(natural), at_once):
-            some = natural[i : i + at_once]
-            rows = self._log_densities(some, Serial.before)
-            value[i : i + at_once] = rows.sum(axis=1)
-        return value
 
     def _log_densities(self, natural: Array, given: _Given) -> Array:
         """Log density of the noise of every row given others, where it is correlated, (k, n)."""
@@ -308,13 +293,13 @@ class Problem:
 
     def log_likelihood_rows(self, t: Array) -> Array:
         """Log likelihood of every row by itself, shape (k, n)."""
-        natural = self.theta(t)
-        if not self.noise.usual:
+        natural, uncertain = self.theta(t), self.bound.model.uncertain
+        if uncertain is None:
             density = self.noise.log_density(self.residuals(natural), natural, self.conditions)
             return density + self._ln_jacobian
-        residuals, unknown, curves = self._predicted(natural)
+        predicted, unknown, curves = uncertain(self.of_model(natural), self.conditions)
         sigma = np.sqrt(natural[:, -1:] ** 2 + unknown[:, None] * (curves**2).sum(axis=1))
-        z = residuals / sigma
+        z = (self.response - predicted) / sigma
         return np.asarray(-0.5 * z * z - np.log(sigma) - HALF_LN_2PI + self._ln_jacobian)
 
     def log_prob(self, t: Array) -> Array:
@@ -386,13 +371,13 @@ def build_problem(
         raise error.within(table.source) from None
     assumed = {name: value for name, value in relative.items() if name not in references}
     notes = tuple(
-        f"the data have no column {name}, so priors that are relative to it assume {value:g}; give "
-        "it if yours differs"
+        f"the data have no column {name}, so priors that are relative to it assume "
+        f"{_with_unit(name, value)}; give it if yours differs"
         for name, value in assumed.items()
     )
     noise = noise_of(priors.noise, model.select(table.columns), priors.source)
     if model.uncertain is not None:
-        noise.must_be_usual(priors.source, f"the emulator {model.name}")
+        noise.must_be_iid_normal(priors.source, f"the emulator {model.name}")
     problem = Problem(bound, table, priors, notes, noise)
     _ = problem.serial  # refused here, not in the middle of an estimation
     problem = problem.with_fixed(fixed) if fixed else problem

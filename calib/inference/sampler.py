@@ -162,7 +162,7 @@ def sample_posterior(
     chosen = settings or SamplerSettings()
     if chosen.walkers is None:
         # Where an evaluation is dear, fewer walkers are run.
-        long, dear = problem.squares.n_distinct > LONG_DATA, model.slow or model.uncertain
+        long, dear = problem.squares.mean.size > LONG_DATA, model.slow or model.uncertain
         few = 20 if long else 64 if dear else 320
         chosen = replace(chosen, walkers=max(few, 2 * (d + 1)))
     walkers = chosen.n_walkers(d)

@@ -20,7 +20,7 @@ from scipy.linalg import qr
 
 from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
-from calib.inference.constants import CHUNK_CELLS, FLAT_PART, SHORT_DATA
+from calib.inference.constants import FLAT_PART, SHORT_DATA
 from calib.inference.mode import prior_widths
 from calib.inference.problem import Problem
 from calib.models.base import Array, BoundModel, Conditions
@@ -55,21 +55,6 @@ class PointEstimate:
     def rmse_unit(self) -> str:
         """Unit of the RMSE."""
         return self.cost_unit.removesuffix("^2").strip("()")
-
-
-def residuals(problem: Problem, natural: Array) -> Array:
-    """Observed minus predicted on the scale of the response, in chunks, shape (k, d_all) to (k, n).
-
-    Natural parameters have the noise scale last. NaN where the model has no value.
-    """
-    k, n = natural.shape[0], problem.response.size
-    at_once = max(1, CHUNK_CELLS // n)
-    if k <= at_once:
-        return problem.residuals(natural)
-    out = np.empty((k, n))
-    for i in range(0, k, at_once):
-        out[i : i + at_once] = problem.residuals(natural[i : i + at_once])
-    return out
 
 
 def sum_of_squares(problem: Problem, natural: Array) -> Array:
@@ -195,7 +180,7 @@ def _flat_at_points(problem: Problem) -> list[tuple[int, ...]]:
     for point in np.vstack([centre, problem.priors.ppf(0.2 + 0.6 * steps)]):
         step = 1e-4 * np.diag(width)
         pairs = problem.theta(np.concatenate([point + step, point - step]))
-        ahead, behind = np.split(residuals(problem, pairs), 2)
+        ahead, behind = np.split(problem.residuals(pairs), 2)
         jacobian = ((behind - ahead) / 2e-4).T  # per prior standard deviation
         if np.isfinite(jacobian).all():
             upper, order = qr(jacobian, mode="r", pivoting=True, check_finite=False)
@@ -248,7 +233,7 @@ class SearchSpace:
         return sum_of_squares(self.problem, self.natural(x))
 
     def _residuals(self, x: Array) -> Array:
-        return np.asarray(residuals(self.problem, self.natural(x[None]))[0])
+        return np.asarray(self.problem.residuals(self.natural(x[None]))[0])
 
     def polish(self, x: Array) -> Found:
         """Descend from a point of the box (d,) by least squares; never to a higher cost."""

@@ -17,8 +17,6 @@ from typing import Any, Literal, NamedTuple
 from unicodedata import normalize
 from xml.etree import ElementTree
 
-from pydantic import BaseModel, ConfigDict, Field
-
 from calib.models.base import (
     Alone,
     Array,
@@ -39,75 +37,42 @@ class Equation(NamedTuple):
     bind_references: Callable[[Conditions], dict[str, float]] = no_references
 
 
-class Published(BaseModel):
-    """A parameter as it is published; its meaning is left out where it is sampled as it is."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    unit: str
-    meaning: str = ""
-
-
-class Card(BaseModel):
-    """What is said of a model; all but `symbols` are fields of `Model` or parts of them.
-
-    Parameters
-    ----------
-    parameters : dict of str to str
-        Meaning of each sampled parameter, in the order of `theta`.
-    symbols : dict of str to str
-        Meaning and unit of the other letters of the equation; those after a dollar are set as
-        mathematics.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    title: str
-    output: str
-    conditions: tuple[str, ...] = Field(min_length=1)
-    parameters: dict[str, str] = Field(min_length=1)
-    reported: dict[str, Published] = {}
-    response: Literal["identity", "log"] = "identity"
-    equation: tuple[str, ...] = Field(min_length=1)
-    symbols: dict[str, str] = Field(min_length=1)
-    numbers: str = ""
-    source: str = Field(min_length=1)
-    cited: str = ""
-    applies: str = Field(pattern=r"\.$")
-    parametrisation: str = "The parameters of the equation are sampled."
-    parabolic_in: str = ""
-    estimates_all_rows: bool = False
-    alone: Alone | None = None
-    searched: dict[str, tuple[float, float]] = {}
-    joined: tuple[str, str, str] | None = None
-    slow: bool = False
-
-    def model(self, name: str, equation: Equation) -> Model:
-        """Return the model of this card and its equation."""
-        published = {p: said.meaning for p, said in self.reported.items() if said.meaning}
-        letters = [
-            f"[{symbol}] the {words}" if symbol.startswith("$") else f"{symbol} the {words}"
-            for symbol, words in self.symbols.items()
-        ]
-        apart = {"parameters", "reported", "equation", "symbols"}
-        return Model(
-            name=name,
-            parameters=tuple(self.parameters),
-            reported={p: said.unit for p, said in self.reported.items()},
-            meanings=self.parameters | published,
-            latex=self.equation,
-            letters=", ".join(letters),
-            **{key: getattr(self, key) for key in type(self).model_fields if key not in apart},
-            **equation._asdict(),
-        )
-
-
 def from_cards(module: str, **equations: Equation) -> tuple[Model, ...]:
     """Return the models of a module by the cards in its file, in the order of the equations."""
     path = Path(__file__).parent / "cards" / f"{module}.toml"
     shared = tomllib.loads(path.read_text(encoding="utf-8"))
     models: dict[str, dict[str, Any]] = shared.pop("models")
     return tuple(
-        Card.model_validate(_continued(models[name], shared)).model(name, equation)
+        _model(name, _continued(models[name], shared), equation)
         for name, equation in equations.items()
+    )
+
+
+def _model(name: str, card: dict[str, Any], equation: Equation) -> Model:
+    """Return a model of its equation and its card.
+
+    A card has fields of `Model`; `parameters` and `reported` with their meanings, and `symbols`,
+    the meaning and unit of the other letters: those after a dollar are set as mathematics.
+    """
+    parameters, symbols = card.pop("parameters"), card.pop("symbols")
+    reported: dict[str, dict[str, str]] = card.pop("reported", {})
+    published = {p: said["meaning"] for p, said in reported.items() if "meaning" in said}
+    letters = [
+        f"[{symbol}] the {words}" if symbol.startswith("$") else f"{symbol} the {words}"
+        for symbol, words in symbols.items()
+    ]
+    fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in card.items()}
+    if "alone" in card:
+        fields["alone"] = Alone(**card["alone"])
+    return Model(
+        name=name,
+        parameters=tuple(parameters),
+        reported={p: said["unit"] for p, said in reported.items()},
+        meanings=parameters | published,
+        latex=fields.pop("equation"),
+        letters=", ".join(letters),
+        **fields,
+        **equation._asdict(),
     )
 
 

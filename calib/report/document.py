@@ -87,14 +87,14 @@ def _verdict(result: OutputResult) -> dict[str, Any]:
 
 def _noise(noise: Noise, preference: NoisePreference | None) -> dict[str, Any]:
     """What the prior file asks for beyond normal noise of one standard deviation."""
-    if noise.usual or preference is None:
+    if noise.iid_normal or preference is None:
         return {}
     depends = {"column": noise.column, "centre": noise.centre, "spread": noise.spread}
     return {
         "noise": {
-            "family": noise.choice.family,
+            "family": noise.family,
             "depends_on": depends if noise.column else None,
-            "correlated_along": noise.choice.correlated_along or None,
+            "correlated_along": noise.correlated_along or None,
             "against_normal": {
                 "elpd_difference": preference.elpd,
                 **_picked(preference, "se", "preferred", "sentence"),

@@ -211,7 +211,7 @@ def _contradicted(calibration: Calibration) -> Iterator[Check]:
         told = remark("contradicted", estimates=" and ".join(said), part=part)
         yield Check(float(scipy.stats.f.sf(ratio, free, left)), told)
     scale = calibration.summary.get("sigma")
-    if scale is not None and problem.noise.usual and problem.bound.model.uncertain is None:
+    if scale is not None and problem.noise.iid_normal and problem.bound.model.uncertain is None:
         squares = min(with_prior, without) * (mode[0, -1] / scale.median) ** 2
         law = scipy.stats.chi2(left)
         scatter = plain_number(scale.median * np.sqrt(squares / left))

@@ -24,7 +24,7 @@ from calib.errors import CalibError
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import estimate
 from calib.inference.io import save_calibration
-from calib.inference.likelihood import NORMAL, USUAL, Noise
+from calib.inference.likelihood import IID_NORMAL, Noise
 from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
 from calib.inference.sampler import Progress, SamplerSettings
@@ -337,17 +337,20 @@ class NoisePreference:
 def noise_words(noise: Noise) -> str:
     """Name a noise in plain words."""
     law = "Student-t noise" if noise.student else "normal noise"
-    along = noise.choice.correlated_along
-    said = [f"depends on {noise.choice.depends_on}"] * bool(noise.column)
+    along = noise.correlated_along
+    said = [f"depends on {noise.depends_on}"] * bool(noise.column)
     said += [f"is correlated along {along}"] * bool(along)
     return f"{law} that {' and '.join(said)}" if said else law
 
 
 def with_usual_noise(problem: Problem) -> Problem:
     """Return a problem with normal noise of one standard deviation, and the same other priors."""
-    left_out = problem.noise.choice.parameters
+    left_out = problem.noise.parameters
     kept = tuple(p for p in problem.priors.entries if p.name not in left_out)
-    return replace(problem, noise=NORMAL, priors=replace(problem.priors, entries=kept, noise=USUAL))
+    return replace(
+        problem, noise=IID_NORMAL,
+        priors=replace(problem.priors, entries=kept, noise=IID_NORMAL),
+    )  # fmt: skip
 
 
 def noise_preference(
@@ -368,7 +371,7 @@ def noise_preference(
     Vehtari, Gelman & Gabry (2017), doi:10.1007/s11222-016-9696-4.
     """
     problem = calibration.problem
-    if problem.noise.usual:
+    if problem.noise.iid_normal:
         return None
     usual = calibrate(
         with_usual_noise(problem), calibration.seed, label=f"{calibration.label} normal noise",

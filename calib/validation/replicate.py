@@ -22,7 +22,6 @@ from calib.data.registry import Registry
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.emulation.prepared import emulated
-from calib.inference.emulation.state import EmulationSettings
 from calib.inference.estimators import estimate
 from calib.inference.prior_files import PriorFile
 from calib.inference.problem import Problem, build_problem
@@ -217,10 +216,10 @@ def most_runs(model: str, found: SlowSimulator, design: Design, simulations: int
             where=f"simulator {found.name}", expected="a simulator that can be run",
             hint="declare the program that made the table, or leave the model out",
         )  # fmt: skip
-    settings = EmulationSettings(**(found.budget or {}))  # type: ignore[arg-type]
+    settings = found.emulation
     free = len(build_problem(model, design.table).priors.free) - 1
     # Without a folder nothing is kept from one campaign to the next.
-    shared = found.folder is not None and settings.sequential
+    shared = found.folder is not None
     first = settings.spread(free, found.simulator.deterministic) if shared else 0
     # A truth is run at the conditions of the design and at those held out.
     each = settings.runs - first + 2

@@ -196,7 +196,7 @@ def unexplained(
 
 def _unused(problem: Problem) -> dict[str, NDArray[np.str_] | Array]:
     """Columns of the file that neither the model nor the noise uses, other outputs left out."""
-    choice = problem.noise.choice
+    choice = problem.noise
     own = {*problem.conditions, *OUTPUTS.values(), problem.bound.model.output}
     noise = (choice.depends_on, choice.correlated_along)
     own |= {n for n in problem.table if n in QUANTITIES and QUANTITIES[n].stem in noise}

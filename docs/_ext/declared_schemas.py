@@ -10,7 +10,7 @@ from calib.batch.campaign.kinds import KINDS
 from calib.check.check import Manifest
 from calib.inference.io import RunRecord
 from calib.inference.prior_files import PriorFileContent
-from calib.models.simulators.declaration import SimulatorFile
+from calib.models.simulators.files import SimulatorFile
 from calib.report.comparison import ComparisonRecord
 
 

@@ -28,7 +28,8 @@ from calib.gap.case import read_case
 from calib.inference.prior_files import default_priors, parse_priors, read_priors
 from calib.inference.problem import build_problem
 from calib.models import MODELS, example_csv
-from calib.models.simulators.declaration import models_of, read_simulator
+from calib.models.simulators.declaration import models_of
+from calib.models.simulators.files import read_simulator
 from tests.models.simulators.examples import PROGRAM, write_program
 
 FEW, MANY = 25, 5_000

@@ -31,12 +31,13 @@ from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
 from calib.inference.prior_files import default_priors, read_priors
 from calib.models import MODELS, example_csv
-from calib.models.simulators.declaration import SIMULATED, read_simulator, register_file
+from calib.models.simulators.declaration import SIMULATED
+from calib.models.simulators.files import read_simulator, register_file
+from calib.models.simulators.process import run_program
 from calib.models.simulators.runner import (
     CallableRunner,
     CommandRunner,
     output_of_text,
-    run_program,
 )
 from calib.models.simulators.simulator import Failure, Output, RunKeeper, Simulator
 from tests.abuse.test_writing import mounted

@@ -16,7 +16,8 @@ from calib.gap.case import Case
 from calib.inference.emulation import Emulation
 from calib.inference.emulation.state import HeldOut
 from calib.models import MODELS
-from calib.models.simulators.declaration import SIMULATED, read_simulator
+from calib.models.simulators.declaration import SIMULATED
+from calib.models.simulators.files import read_simulator
 from calib.models.simulators.simulator import Failure, Run
 from tests.models.simulators.examples import lab, write_program
 from tests.registered import forgotten

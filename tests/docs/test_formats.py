@@ -23,7 +23,7 @@ from calib.gap.effects import View
 from calib.inference.io import RunRecord
 from calib.inference.sampler import SamplerSettings
 from calib.models import example_csv
-from calib.models.simulators.declaration import SimulatorFile
+from calib.models.simulators.files import SimulatorFile
 from calib.report.sbc import write_sbc
 from calib.validation.sbc import run_sbc
 from tests.commands import Calib

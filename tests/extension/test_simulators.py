@@ -19,7 +19,8 @@ import calib
 from calib.batch.folders import check_folder
 from calib.gap.case import Case
 from calib.models import MODELS
-from calib.models.simulators.declaration import SIMULATED, read_simulator
+from calib.models.simulators.declaration import SIMULATED
+from calib.models.simulators.files import read_simulator
 from calib.models.simulators.simulator import Failure
 from tests.commands import Calib
 from tests.models.simulators.examples import PRIORS, lab, pull, write_program

@@ -17,7 +17,7 @@ from calib.inference.calibration import Calibration, calibrate
 from calib.inference.emulation.prepared import emulated
 from calib.inference.estimators import estimate, methods_for
 from calib.inference.io import load_calibration, save_calibration
-from calib.inference.likelihood import Noise, NoiseChoice
+from calib.inference.likelihood import Noise
 from calib.inference.prior_files import default_priors, parse_priors
 from calib.inference.problem import Problem, build_problem
 from calib.models import MODELS, example_csv, get_model
@@ -74,7 +74,7 @@ def test_densities_are_scipys(tmp_path: Path, model: str, extra: str) -> None:
 
 def test_normal_noise_of_one_sd_is_the_default_whoever_says_so(tmp_path: Path) -> None:
     said = problem_with(tmp_path, '[likelihood]\nfamily = "normal"\n', he2019_table("rut_depth"))
-    assert said.noise.usual
+    assert said.noise.iid_normal
     assert said.names == build_problem("modified_bekker", said.table).names
 
 
@@ -109,7 +109,7 @@ def test_the_gamma_prior_is_scipys(lower: float | None) -> None:
 
 def test_noise_is_drawn_as_its_density_says() -> None:
     rng, slip = np.random.default_rng(3), np.array([0.1, 0.3, 0.5])
-    noise = Noise(NoiseChoice("student_t", "slip"), "slip_ratio", 0.3, 0.2)
+    noise = Noise("student_t", "slip", "", "slip_ratio", 0.3, 0.2)
     nu, slope, sigma = 3.0, 0.7, 0.2
     natural = np.tile([9.0, nu, slope, sigma], (4000, 1))
     conditions = {"slip_ratio": slip}

@@ -15,7 +15,7 @@ import calib
 from calib.data import hold_out, table_from_arrays
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration, calibrate
-from calib.inference.likelihood import Noise, NoiseChoice
+from calib.inference.likelihood import Noise
 from calib.inference.priors import Priors
 from calib.inference.problem import Problem
 from calib.models import MODELS
@@ -194,8 +194,7 @@ def test_a_model_that_gives_a_row_no_density_is_refused(
 # The noise of a calibration against normal noise
 
 SLIP = np.linspace(0.0, 0.6, 40)
-CHOICE = NoiseChoice("student_t", "slip")
-NOISE = Noise(CHOICE, "slip_ratio", float(SLIP.mean()), float(SLIP.std()))
+NOISE = Noise("student_t", "slip", "", "slip_ratio", float(SLIP.mean()), float(SLIP.std()))
 
 
 def noisy_line(noise: np.ndarray) -> Problem:
@@ -206,7 +205,7 @@ def noisy_line(noise: np.ndarray) -> Problem:
     usual = problem_of(
         lambda a, b, s: a + b * s, [*priors[:2], priors[-1]], SLIP, 1.0 + SLIP + noise
     )
-    return replace(usual, noise=NOISE, priors=Priors(tuple(priors), noise=CHOICE))
+    return replace(usual, noise=NOISE, priors=Priors(tuple(priors), noise=NOISE))
 
 
 def calibrated(noise: np.ndarray) -> Calibration:

@@ -10,7 +10,7 @@ from scipy import stats
 
 from calib.data.quantities import OUTPUTS
 from calib.he2019.embedded import he2019_tasks
-from calib.inference.likelihood import Noise, NoiseChoice
+from calib.inference.likelihood import Noise
 from calib.inference.mode import find_mode
 from calib.inference.priors import Priors
 from calib.inference.problem import Problem, build_problem
@@ -120,7 +120,7 @@ def test_noise_that_depends_on_a_condition_is_noticed_and_the_remedy_works(
 
 def uneven(problem: Problem) -> Problem:
     """The problem with noise that depends on slip."""
-    noise = Noise(NoiseChoice("normal", "slip"), "slip_ratio", SLIP.mean(), SLIP.std())
+    noise = Noise("normal", "slip", "", "slip_ratio", SLIP.mean(), SLIP.std())
     *others, sigma = problem.priors.entries
     priors = Priors((*others, normal("sigma_slope", 0.0, 0.5), sigma))
     return replace(problem, noise=noise, priors=priors)
@@ -147,7 +147,7 @@ def test_heavy_tails_are_noticed_and_the_remedy_works() -> None:
     assert 'family = "student_t"' in found
     *others, sigma = problem.priors.entries
     priors = Priors((*others, normal("nu", 0.0, 1.0, log=True), sigma))
-    student = replace(problem, noise=Noise(NoiseChoice("student_t")), priors=priors)
+    student = replace(problem, noise=Noise("student_t"), priors=priors)
     assert "tails" not in notes(student, np.array([1.0, 1.0, np.log(1.5), np.log(0.05)]))
 
 

@@ -41,7 +41,6 @@ from calib.inference.design import (
 )
 from calib.inference.emulation.state import (
     Emulation,
-    EmulationSettings,
     HeldOut,
     Progress,
     State,
@@ -51,6 +50,7 @@ from calib.inference.problem import Problem
 from calib.inference.random import generator
 from calib.models.base import Array
 from calib.models.constants import FIRST_RUNS
+from calib.models.simulators.declaration import EmulationSettings
 from calib.models.simulators.emulator import Emulator
 from calib.models.simulators.kriging import correlation
 from calib.models.simulators.simulator import FROM_THE_START, Run, RunKeeper, fail_alike
@@ -126,14 +126,14 @@ def _improved(state: State, chosen: EmulationSettings, most: int, own_noise: flo
         # learned from its check.
         ran = 0 if measured is None else measured.runs
         good = ran >= 0.75 * checks and (measured is None or measured.rmse <= chosen.tolerance)
-        partly = state.emulator is not None and state.emulator.support is not None
-        if partly and state.holds(z).any():
+        partly = state.emulator.support is not None
+        if partly and state.emulator.holds(z).any():
             # Where no run was made among those that failed there may seem to be room.
             z = state.sample(len(history) + 2)
             good &= state.among_failed(z) <= AMONG_FAILED
         if good or state.left <= checks:
             break
-    if not state.holds(z).any():
+    if not state.emulator.holds(z).any():
         raise state.without_value("no parameters are left for the data")
     if partly and state.among_failed(z) > AMONG_FAILED:
         raise state.without_value("the posterior lies among runs that failed")
@@ -161,7 +161,7 @@ def _needed(
         history.append((len(state.runs), state.error(z)))
         room = state.left - checks
         small = history[-1][1] <= WORTH * chosen.tolerance
-        if state.emulator is not None and state.emulator.support is not None:
+        if state.emulator.support is not None:
             # An edge has to be found as well: the error has to be small twice in a row.
             last = [error for _, error in history[began:]][-2:]
             small = len(last) > 1 and max(last) <= EDGE_WORTH * chosen.tolerance
@@ -206,10 +206,7 @@ def _first_design(state: State, chosen: EmulationSettings) -> float:
     """Spread runs over the prior, some of them twice; return the sd of the simulator's noise."""
     d, deterministic = int(state.free.sum()), state.keeper.simulator.deterministic
     before = len(state.runs)
-    theta = prior_design(
-        state.problem, chosen.spread(d, deterministic, before), state.seed,
-        latin=not chosen.sequential,
-    )  # fmt: skip
+    theta = prior_design(state.problem, chosen.spread(d, deterministic, before), state.seed)
     values, across = state.carry_out(theta[:FIRST_RUNS]), state.across
     if fail_alike(state.runs[before:]) and fail_alike(state.runs):
         raise state.without_value(FROM_THE_START)
@@ -248,7 +245,7 @@ def _next(state: State, z: Array, count: int, step: int) -> Array:
     """Pick the runs to make next: where the emulator knows least of what the posterior needs."""
     rng = generator(state.seed, state.label, "next", step)
     candidates = inner = z[rng.permutation(len(z))[:400]]
-    if state.emulator is None or state.region is None:
+    if state.region is None:
         return candidates[:count]
     if state.emulator.support is not None:
         # There may be values beyond where some are known: half are looked for farther out.
@@ -287,8 +284,6 @@ _SCATTERS = "its output scatters: write deterministic = false in the simulator f
 def held_out(state: State, theta: Array, values: Array) -> HeldOut | None:
     """Compare the emulator with runs that it has not seen; None where none has a value."""
     emulator = state.emulator
-    if emulator is None:
-        return None
     means, variances = emulator.with_variance(theta)
     ok = np.isfinite(values).all(axis=1) & np.isfinite(means).all(axis=1)
     true = (values[ok] - emulator.mean) @ emulator.curves.T
@@ -300,7 +295,7 @@ def held_out(state: State, theta: Array, values: Array) -> HeldOut | None:
 def left_out(state: State) -> HeldOut | None:
     """Compare each run where the posterior is with what the others say; None of a few."""
     emulator, region = state.emulator, state.region
-    if emulator is None or region is None:
+    if region is None:
         return None
     training = emulator.training
     there = region.inside(state.axes.of(training.theta[training.ok]))
@@ -315,8 +310,6 @@ def left_out(state: State) -> HeldOut | None:
 
 def _compared(state: State, off: Array, rest: Array, variances: Array) -> HeldOut:
     """Judge errors of the coefficients (k, j), and of what the basis cannot hold, (k, m)."""
-    if state.emulator is None:
-        raise AssertionError
     rows = state.emulator.curves_at(state.problem.conditions)[:, 1:]
     errors = off @ rows.T
     total = np.square(errors).sum(axis=1) + np.square(rest).mean(axis=1) * len(rows)
@@ -337,8 +330,6 @@ def judged(
     own_noise: float, history: Sequence[tuple[int, float]],
 ) -> Emulation:  # fmt: skip
     """Put together what became of an emulation, and whether it is good enough."""
-    if state.emulator is None:
-        raise AssertionError
     expected, between = state.error(z), _between(state, z)
     wider, shifted = _consequences(state, z, measured)
     reasons = []
@@ -397,8 +388,8 @@ def foreseen(
 def idle(state: State, z: Array) -> list[str]:
     """Name parameters that move no output by what is looked into, wherever draws have them."""
     entries, emulator = state.problem.priors.entries[:-1], state.emulator
-    z = z[state.holds(z)]
-    if emulator is None or not len(z):
+    z = z[state.emulator.holds(z)]
+    if not len(z):
         return []
     at, found = emulator.curves_at(state.problem.conditions)[:, 1:].T, []
     usual = emulator.coefficients(state.axes.natural(z))
@@ -413,13 +404,11 @@ def idle(state: State, z: Array) -> list[str]:
 
 def _between(state: State, z: Array) -> float:
     """Rms error at conditions between the nodes, in sds of the noise."""
-    if state.emulator is None:
-        raise AssertionError
     over = state.emulator.over
     left_out = over.left_out(np.concatenate([state.emulator.mean[None], state.emulator.curves]))
     # At the ends of the box a node that is left out has none beyond it.
     left_out = left_out[:, ((over.nodes > 0.0) & (over.nodes < 1.0)).all(axis=1)]
-    theta = state.axes.natural(z[state.holds(z)][:64])
+    theta = state.axes.natural(z[state.emulator.holds(z)][:64])
     c = np.concatenate([np.ones((len(theta), 1)), state.emulator.coefficients(theta)], axis=1)
     squares = np.square(c @ left_out)
     return float(np.sqrt(np.nanmean(squares))) / state.sigma if squares.size else 0.0
@@ -446,8 +435,8 @@ def _consequences(
     names = [
         p.name for p, free in zip(state.problem.priors.entries, state.free, strict=False) if free
     ]
-    z = z[state.holds(z)]
-    if emulator is None or len(z) < 2 * len(names) + 2:
+    z = z[state.emulator.holds(z)]
+    if len(z) < 2 * len(names) + 2:
         return {}, {}
     means, unknown = emulator.with_unknown(state.axes.natural(z))
     rows = emulator.curves_at(state.problem.conditions)[:, 1:]

@@ -21,19 +21,20 @@ from calib.data.table import parse_header
 from calib.errors import CalibError
 from calib.inference.design import check_moves, check_scale
 from calib.inference.emulation import emulate, extend, judged, left_out
-from calib.inference.emulation.state import Emulation, EmulationSettings, Progress, State
+from calib.inference.emulation.state import Emulation, Progress, State
 from calib.inference.prior_files import PriorFile
 from calib.inference.problem import Problem, build_problem
 from calib.models import get_model
 from calib.models.base import Array
 from calib.models.simulators.declaration import (
     SIMULATED,
+    EmulationSettings,
     Simulated,
-    load_files,
     simulated_by,
     slow_simulator,
 )
 from calib.models.simulators.emulator import Emulator, Training, emulator_of, save_emulator
+from calib.models.simulators.files import load_files
 from calib.models.simulators.runner import TableRunner, columns_of
 from calib.models.simulators.simulator import FAILED, Failure, Run, RunKeeper, Simulator
 
@@ -207,9 +208,9 @@ def emulated(
     CalibError
         If the model is no simulator's.
     """
-    problem.noise.must_be_usual(problem.priors.source, "an emulator")
+    problem.noise.must_be_iid_normal(problem.priors.source, "an emulator")
     found = _simulated(problem.bound.model.name)
-    settings = EmulationSettings(**(found.budget or {}))  # type: ignore[arg-type]
+    settings = found.emulation
     if isinstance(found.simulator.runner, TableRunner):
         return emulate_table(problem, found.simulator, seed, settings, progress)
     keeper = _keeper(found, workers, scheduler, progress, settings.runs)
@@ -323,10 +324,11 @@ def _extended(
     found: Simulated, emulator: Emulator, problem: Problem, seed: int, workers: int,
     progress: Progress | None,
 ) -> Emulation:  # fmt: skip
-    settings = EmulationSettings(**(found.budget or {}))  # type: ignore[arg-type]
     more = 100
     keeper = _keeper(found, workers, None, progress, more)
-    return extend(emulator, problem, keeper, seed, settings=settings, more=more, progress=progress)
+    return extend(
+        emulator, problem, keeper, seed, settings=found.emulation, more=more, progress=progress
+    )
 
 
 def reaches(model: str, tables: Sequence[Table]) -> bool:

@@ -34,67 +34,6 @@ type Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
-class EmulationSettings:
-    """How many runs an emulator may take, and how good it has to be.
-
-    Parameters
-    ----------
-    runs : int
-        At most, whatever they are made for, those of an earlier call with the same cache among
-        them. A run that is tried again after it failed counts once.
-    first : int, optional
-        Of the space-filling design over the prior; ten for each parameter by default.
-    checks : int, optional
-        Runs at draws of the posterior that the emulator is checked on before it sees them, a fifth
-        of all at most; 20 by default, or the fifth.
-    tolerance : float
-        Largest rms error of the emulator over rows and posterior, in sds of the noise. It is
-        checked when somewhat less is expected. At 0.1 the error adds 1 % to the variance of a
-        reading, which the likelihood accounts for.
-    nodes : int, optional
-        Conditions at which each run is evaluated, see `calib.inference.design`.
-    sequential : bool
-        Whether points are put where the posterior needs them; else the whole budget is one
-        Latin hypercube over the prior.
-    """
-
-    runs: int = 200
-    first: int | None = None
-    checks: int | None = None
-    tolerance: float = 0.1
-    nodes: int | None = None
-    sequential: bool = True
-
-    def __post_init__(self) -> None:
-        for key, found, most, why in (
-            ("checks", self.checks, self.runs // 5, "a fifth of the runs"),
-            ("first", self.first, self.runs - self.checks_of(self.runs),
-             "the runs less those that it is checked on"),
-        ):  # fmt: skip
-            if found is not None and found > most:
-                raise CalibError(
-                    f"{key} = {found} is more than runs = {self.runs} leaves room for",
-                    where=f"emulator.{key}", expected=f"at most {most}, {why}",
-                    hint="lower it, or give more runs",
-                )  # fmt: skip
-
-    def checks_of(self, most: int) -> int:
-        """How many of so many runs are kept for the check."""
-        wanted = 20 if self.checks is None else self.checks
-        return min(wanted, most // 5) if self.sequential else 0
-
-    def repeats(self, deterministic: bool) -> tuple[int, int]:
-        """How many of the first runs are made again, to see whether they differ, and how often."""
-        return (1, 1) if deterministic else (min(5, max(self.runs // 10, 1)), 2)
-
-    def spread(self, free: int, deterministic: bool, made: int = 1) -> int:
-        """How many runs are spread over the prior of so many parameters, where some are made."""
-        runs, times = self.repeats(deterministic)
-        most = max(self.runs - made - runs * times - self.checks_of(self.runs), 1)
-        return min(self.first or 10 * free, most) if self.sequential else most
-
-
-@dataclass(frozen=True)
 class HeldOut:
     """The emulator against runs that it had not seen, at draws of the posterior.
 
@@ -219,7 +158,7 @@ class State:
         self.runs: list[Run] = list(tried)
         self.sigma = 0.1 * float(problem.response.std())
         self.own_noise = 0.0
-        self.emulator: Emulator | None = None
+        self._emulator: Emulator | None = None
         self.emulated = problem
         self.mode: Array | None = None
         self.region: Region | None = None
@@ -234,10 +173,17 @@ class State:
         nodes = emulator.training.nodes
         across = across_zero(nodes)
         state = cls(problem, keeper, nodes, seed, most, "extend", across, progress=progress)
-        state.training, state.emulator = emulator.training, emulator
+        state.training, state._emulator = emulator.training, emulator
         state.earlier = emulator.regions
         state._emulate(emulator)
         return state
+
+    @property
+    def emulator(self) -> Emulator:
+        """The emulator; there is none before the first `rebuild`."""
+        if self._emulator is None:
+            raise RuntimeError("nothing was emulated yet")
+        return self._emulator
 
     @property
     def left(self) -> int:
@@ -258,7 +204,7 @@ class State:
             self.runs = [*map(across_too, self.runs[:before]), *self.runs[before:]]
             values = values[:, ~self.across]
             self._give_up_across()
-            if self.emulator is not None:
+            if self._emulator is not None:
                 self.rebuild()
             values[lost[0]] = plain
             lost = lost[1 : 1 + self.left]
@@ -317,16 +263,16 @@ class State:
         """Fit the emulator again to all runs."""
         if self._wild_near():
             self._give_up_across()
-        known, runs = self.emulator, len(self.training.theta)
+        known, runs = self._emulator, len(self.training.theta)
         self._tell("runs in the emulator", 0 if known is None else len(known.training.theta), runs)
         again = self.region is None or known is None or known.mean.size != self.across.size
-        self.emulator = build_emulator(
+        self._emulator = build_emulator(
             replace(self.training, values=self.tamed(self.training.values)), self.axes,
             NEGLIGIBLE * self.sigma, self._regions,
             scales=None if known is None else known.functions.scales,
             over=None if again or known is None else known.over,
         )  # fmt: skip
-        self._emulate(self.emulator)
+        self._emulate(self._emulator)
         self._tell("runs in the emulator", runs, runs)
 
     def _tell(self, what: str, done: int, planned: int) -> None:
@@ -393,12 +339,6 @@ class State:
         rows = self.problem.response.size
         return float(np.sqrt(self.row_variance(z).mean() / rows)) / self.sigma
 
-    def holds(self, z: Array) -> NDArray[np.bool_]:
-        """Whether there is a value at draws, as far as is known."""
-        if self.emulator is None:
-            return np.zeros(len(z), dtype=bool)
-        return self.emulator.holds(z)
-
     def among_failed(self, z: Array) -> float:
         """Return the share of draws to which a run that failed is closer than any other."""
         if self.region is None:
@@ -409,8 +349,6 @@ class State:
 
     def row_variance(self, z: Array) -> Array:
         """Sum over the data's rows of the emulator's variance, shape (k,)."""
-        if self.emulator is None:
-            return np.full(len(z), np.inf)
         _, unknown = self.emulator.with_unknown(self.axes.natural(z))
         curves = self.emulator.curves_at(self.problem.conditions)[:, 1:]
         return unknown * float((curves**2 @ self.emulator.variances).sum())

@@ -1,28 +1,24 @@
-"""Declarations of simulators, in a TOML file or Python, and the models that stand for them."""
+"""Declarations of simulators, and the models that stand for them."""
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import re
-import shlex
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FunctionType
-from typing import Annotated, Any, Literal
+from typing import Any, Self
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from calib.batch.user_code import load, run_file
-from calib.data.files import TOML_HINT, read_text, read_toml
+from calib.data.files import TOML_HINT
 from calib.data.quantities import QUANTITIES
 from calib.data.registry import Registry, run_again
-from calib.data.table import parse_header
-from calib.errors import CalibError, in_words, meant
+from calib.errors import CalibError, in_words
 from calib.models import MODELS
 from calib.models.base import (
     DIMENSIONS,
@@ -34,14 +30,7 @@ from calib.models.base import (
     check_word,
 )
 from calib.models.constants import LISTED_FAILURES
-from calib.models.simulators.emulator import use_emulator
-from calib.models.simulators.runner import (
-    CallableRunner,
-    CommandRunner,
-    TableRunner,
-    UmbridgeRunner,
-    check_template,
-)
+from calib.models.simulators.runner import CallableRunner, TableRunner
 from calib.models.simulators.simulator import (
     FAILED,
     FROM_THE_START,
@@ -55,8 +44,26 @@ from calib.models.simulators.simulator import (
 )
 
 
-class Budget(BaseModel):
-    """What a user may say of an emulator (see `calib.inference.emulation.EmulationSettings`)."""
+class EmulationSettings(BaseModel):
+    """How many runs an emulator may take, and how good it has to be.
+
+    Parameters
+    ----------
+    runs : int
+        At most, whatever they are made for, those of an earlier call with the same cache among
+        them. A run that is tried again after it failed counts once.
+    first : int, optional
+        Of the space-filling design over the prior; ten for each parameter by default.
+    checks : int, optional
+        Runs at draws of the posterior that the emulator is checked on before it sees them, a fifth
+        of all at most; 20 by default, or the fifth.
+    tolerance : float
+        Largest rms error of the emulator over rows and posterior, in sds of the noise. It is
+        checked when somewhat less is expected. At 0.1 the error adds 1 % to the variance of a
+        reading, which the likelihood accounts for.
+    nodes : int, optional
+        Conditions at which each run is evaluated, see `calib.inference.design`.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     runs: int = Field(default=200, ge=10)
@@ -65,18 +72,46 @@ class Budget(BaseModel):
     tolerance: float = Field(default=0.1, gt=0.0)
     nodes: int | None = Field(default=None, ge=2)
 
+    @model_validator(mode="after")
+    def _leaves_room(self) -> Self:
+        left = self.runs - self.checks_of(self.runs)
+        for key, found, most, why in (
+            ("checks", self.checks, self.runs // 5, "a fifth of the runs"),
+            ("first", self.first, left, "the runs less those that it is checked on"),
+        ):
+            if found is not None and found > most:
+                raise CalibError(
+                    f"{key} = {found} is more than runs = {self.runs} leaves room for",
+                    where=f"emulator.{key}", expected=f"at most {most}, {why}",
+                    hint="lower it, or give more runs",
+                )  # fmt: skip
+        return self
+
+    def checks_of(self, most: int) -> int:
+        """How many of so many runs are kept for the check."""
+        return min(20 if self.checks is None else self.checks, most // 5)
+
+    def repeats(self, deterministic: bool) -> tuple[int, int]:
+        """How many of the first runs are made again, to see whether they differ, and how often."""
+        return (1, 1) if deterministic else (min(5, max(self.runs // 10, 1)), 2)
+
+    def spread(self, free: int, deterministic: bool, made: int = 1) -> int:
+        """How many runs are spread over the prior of so many parameters, where some are made."""
+        runs, times = self.repeats(deterministic)
+        most = max(self.runs - made - runs * times - self.checks_of(self.runs), 1)
+        return min(self.first or 10 * free, most)
+
 
 @dataclass(frozen=True)
 class Simulated:
     """A simulator that is calibrated as one or several models.
 
-    Its runs are kept in a `folder`, or in memory; `budget` are fields of
-    `calib.inference.emulation.EmulationSettings` that the user gave.
+    Its runs are kept in a `folder`, or in memory; `emulation` says how it is emulated.
     """
 
     simulator: Simulator
     folder: Path | None = None
-    budget: Mapping[str, float] | None = None
+    emulation: EmulationSettings = field(default_factory=EmulationSettings)
 
     @property
     def name(self) -> str:
@@ -109,7 +144,7 @@ class Simulated:
     @property
     def _content(self) -> tuple[object, ...]:
         said = {k: v for k, v in vars(self.simulator).items() if k != "runner"}
-        return self.simulator.digest, said, self.folder, self.budget
+        return self.simulator.digest, said, self.folder, self.emulation
 
     @property
     def _functions(self) -> list[FunctionType]:
@@ -284,8 +319,7 @@ def from_callable(
         which is ended with what it has started when they have passed; without a limit, in this
         process, for as long as it takes.
     **budget
-        ``runs``, ``first``, ``checks``, ``tolerance``, ``nodes``: see
-        `calib.inference.emulation.EmulationSettings`.
+        ``runs``, ``first``, ``checks``, ``tolerance``, ``nodes``: see `EmulationSettings`.
 
     Returns
     -------
@@ -335,7 +369,7 @@ def declare(
     map the simulator's own names to headers.
     """
     where = f"simulator {name}"
-    _check_budget(runner, budget or {}, where)
+    emulation = _emulation(runner, budget or {}, where)
     if not isinstance(priors, Mapping) or not priors:
         raise CalibError(
             "there are no parameters with priors",
@@ -362,7 +396,7 @@ def declare(
     text = "\n".join(written(p, priors[p]) for p in parameters)
     simulator = Simulator(name, runner, parameters, text, conditions, tuple(declared), **details)
     _check_own_names(simulator, outputs)
-    return Simulated(simulator, folder, budget)
+    return Simulated(simulator, folder, emulation)
 
 
 def _check_own_names(simulator: Simulator, outputs: Mapping[str, str]) -> None:
@@ -390,20 +424,9 @@ def _check_own_names(simulator: Simulator, outputs: Mapping[str, str]) -> None:
     check_names(DIMENSIONS | reserved, columns, where)
 
 
-def _check_budget(runner: Runner, budget: Mapping[str, float], where: str) -> None:
-    """Refuse a setting of an emulator that does not exist, is impossible, or has no effect."""
-    try:
-        Budget.model_validate(budget)
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(map(str, first["loc"]))
-        raise CalibError(
-            in_words(first),
-            where=f"{where}, emulator.{key}",
-            expected=", ".join(Budget.model_fields),
-            hint="correct it, or leave it out",
-        ) from None
-    idle = sorted(set(budget) - {"tolerance"}) if isinstance(runner, TableRunner) else []
+def _emulation(runner: Runner, given: Mapping[str, float], where: str) -> EmulationSettings:
+    """Return settings; a CalibError if one does not exist, is impossible, or has no effect."""
+    idle = sorted(set(given) - {"tolerance"}) if isinstance(runner, TableRunner) else []
     if idle:
         raise CalibError(
             f"{', '.join(idle)} can do nothing for a table, whose runs and rows are made already",
@@ -411,6 +434,19 @@ def _check_budget(runner: Runner, budget: Mapping[str, float], where: str) -> No
             expected="tolerance",
             hint="leave it out",
         )
+    try:
+        return EmulationSettings.model_validate(given)
+    except CalibError as error:
+        raise error.within(where) from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(map(str, first["loc"]))
+        raise CalibError(
+            in_words(first),
+            where=f"{where}, emulator.{key}",
+            expected=", ".join(EmulationSettings.model_fields),
+            hint="correct it, or leave it out",
+        ) from None
 
 
 def written(name: str, table: Mapping[str, Any]) -> str:
@@ -425,259 +461,3 @@ def _toml(value: Any) -> str:
     if isinstance(value, float) and not math.isfinite(value):
         return repr(value)
     return json.dumps(value, ensure_ascii=False)
-
-
-def _without_null(text: str) -> str:
-    if "\x00" in text:
-        raise ValueError("no path and no command holds a null character")
-    return text
-
-
-_Text = Annotated[str, AfterValidator(_without_null)]
-
-
-class SimulatorFile(BaseModel):
-    """What a simulator file may say; exactly one of run, python, url and table."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-    name: str = Field(pattern=r"^[A-Za-z]\w*$")
-    title: str = ""
-    source: str = ""
-    run: _Text = ""
-    python: _Text = ""
-    url: _Text = ""
-    model: _Text = ""
-    table: _Text = ""
-    input: Literal["json", "csv", "template"] = "json"
-    template: _Text = ""
-    output: Literal["json", "csv", "pattern"] = "json"
-    rows: Literal["all", "each"] = "all"
-    batched: bool = True
-    limit: float = Field(default=600.0, gt=0.0)
-    retries: int = Field(default=1, ge=0)
-    deterministic: bool = True
-    emulate: bool = True
-    cache: _Text = ""
-    files: tuple[_Text, ...] = ()
-    conditions: dict[str, str] = Field(min_length=1)
-    outputs: dict[str, str] = Field(min_length=1)
-    patterns: dict[str, str] = {}
-    ranges: dict[str, tuple[float, float]] = {}
-    emulator: Budget = Budget()
-    parameters: dict[str, dict[str, Any]] = Field(min_length=1)
-
-
-def load_files(paths: Sequence[Path]) -> None:
-    """Load files that register things, here and in processes to come.
-
-    Python files of quantities, models or effects; simulator files (``.toml``); emulators
-    (``.npz``). In this order, for each kind may name what those before it register.
-
-    Raises
-    ------
-    CalibError
-        If one cannot be run, or what it declares does not hold together.
-    """
-    loaders = {".toml": register_file, ".npz": use_emulator}
-    ordered = sorted(
-        map(Path, paths),
-        key=lambda path: ("", *loaders).index(path.suffix if path.suffix in loaders else ""),
-    )
-    load({path: loaders.get(path.suffix, run_file) for path in ordered})
-
-
-def register_file(path: Path) -> Simulated:
-    """Read a simulator file (see `read_simulator`) and make its models known, once."""
-    found = read_simulator(path)
-    found.register()
-    return SIMULATED[found.name]
-
-
-def read_simulator(path: Path) -> Simulated:
-    """Read a simulator file.
-
-    A CalibError names the file and the key: it is not TOML, a key is unknown, missing or
-    impossible, a parameter has no prior, the command does not exist, or a template lacks a place.
-    """
-    path = Path(path).resolve()
-    try:
-        return _declared(path)
-    except CalibError as error:
-        raise error.within(None if str(path) in (error.where or "") else str(path)) from None
-
-
-def _declared(path: Path) -> Simulated:
-    try:
-        file = SimulatorFile.model_validate(read_toml(path))
-    except OSError as error:
-        raise _unreadable("simulator file", error, None) from None
-    except ValidationError as error:  # which is a ValueError
-        raise _explained(error) from None
-    except ValueError as error:
-        raise CalibError(f"not valid TOML: {error}", hint=TOML_HINT) from None
-    made_of = tuple(
-        hashlib.sha256(_content(path.parent / name, "files", f"file {name!r}")).hexdigest()
-        for name in file.files
-    )
-    told = ("title", "source", "limit", "retries", "deterministic", "emulate")
-    return declare(
-        file.name,
-        _runner(file, path.parent),
-        file.parameters,
-        file.conditions,
-        file.outputs,
-        folder=path.parent / (file.cache or f"{path.stem}.runs"),
-        budget=file.emulator.model_dump(exclude_unset=True),
-        ranges=_ranges(file),
-        made_of=made_of,
-        file=str(path),
-        **{key: getattr(file, key) for key in told},
-    )
-
-
-def _explained(error: ValidationError) -> CalibError:
-    errors = error.errors()
-    # A missing key is most often a misspelt one.
-    first = next((e for e in errors if e["type"] == "extra_forbidden"), errors[0])
-    key = ".".join(str(part) for part in first["loc"])
-    if first["type"] == "extra_forbidden":
-        known = list((Budget if key.startswith("emulator.") else SimulatorFile).model_fields)
-        hint = meant(str(first["loc"][-1]), known, "correct its name, or leave it out")
-        return CalibError(f"unknown key {key}", expected=", ".join(known), hint=hint)
-    hint = "add it" if first["type"] == "missing" else "correct it"
-    return CalibError(in_words(first), where=key, hint=hint)
-
-
-def _unreadable(what: str, error: Exception, key: str | None) -> CalibError:
-    why = getattr(error, "strerror", None) or error
-    hint = (
-        "correct the path, which is relative to the simulator file" if key else "correct the path"
-    )
-    return CalibError(f"the {what} cannot be read ({why})", where=key, hint=hint)
-
-
-def _content(path: Path, key: str, what: str) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise _unreadable(what, error, key) from None
-
-
-def _ranges(file: SimulatorFile) -> dict[str, tuple[float, float]]:
-    """Ranges by canonical condition; they are given by the simulator's own names, in its units."""
-    found = {}
-    for name, (low, high) in file.ranges.items():
-        column = parse_header(file.conditions.get(name, ""))
-        if column is None or not low < high:
-            raise CalibError(
-                f"the range [{low:g}, {high:g}] is of no condition, or not from low to high",
-                where=f"ranges.{name}",
-                expected=", ".join(file.conditions),
-                hint="name a condition, and give [low, high]",
-            )
-        low, high = (float(column.to_canonical(v)) for v in (low, high))
-        found[column.quantity.canonical] = (low, high)
-    return found
-
-
-def _runner(file: SimulatorFile, folder: Path) -> Runner:
-    makers: dict[str, Callable[[SimulatorFile, Path], Runner]] = {
-        "run": _command,
-        "python": _callable,
-        "url": _umbridge,
-        "table": _of_table,
-    }
-    given = [key for key in makers if getattr(file, key)]
-    if len(given) != 1:
-        raise CalibError(
-            f"it is not clear how to run it: {', '.join(given) or 'nothing'} is given",
-            expected=f"exactly one of {', '.join(makers)}",
-            hint="give one of them",
-        )
-    return makers[given[0]](file, folder)
-
-
-def _command(file: SimulatorFile, folder: Path) -> CommandRunner:
-    try:
-        arguments, found = tuple(shlex.split(file.run)), "no words"
-    except ValueError as error:
-        arguments, found = (), str(error)
-    if not arguments:
-        raise CalibError(
-            f"{file.run!r} is no command ({found})",
-            where="run",
-            expected='run = "program {input} {output}", in quotes what has spaces in it',
-            hint="correct it",
-        )
-    takes, template = file.input, ""
-    if file.template or takes == "template":
-        takes, template = "template", _template(file, folder)
-    if file.output == "pattern" and set(file.patterns) != set(file.outputs):
-        raise CalibError(
-            "patterns and outputs differ",
-            where="patterns",
-            expected=", ".join(file.outputs),
-            hint="give each output a regular expression",
-        )
-    each = file.rows == "each"
-    runner = CommandRunner(
-        arguments, folder, takes, template, file.output, file.patterns, each, file.limit
-    )
-    if runner.program is None:
-        raise CalibError(
-            f"there is no program {arguments[0]!r}",
-            where="run",
-            expected=f"a program on the search path, or a path relative to {folder.name}/",
-            hint="build or install it, or correct its path",
-        )
-    return runner
-
-
-def _template(file: SimulatorFile, folder: Path) -> str:
-    try:
-        template = read_text(folder / file.template)
-    except (OSError, UnicodeDecodeError) as error:
-        raise _unreadable("template", error, "template") from None
-    noise = {"sigma", *(f"sigma_{own}" for own in file.outputs)}
-    names = tuple(p for p in file.parameters if p not in noise)
-    check_template(template, (*names, *file.conditions), f"template {file.template}")
-    return template
-
-
-def _callable(file: SimulatorFile, folder: Path) -> CallableRunner:
-    script, _, name = file.python.rpartition(":")
-    function = getattr(run_file(folder / script, "simulator"), name, None)
-    if not callable(function):
-        raise CalibError(
-            f"there is no function {name!r} in {script}",
-            where="python",
-            expected='python = "file.py:function"',
-            hint="correct the name",
-        )
-    # Only a limit needs a process of its own.
-    limit = file.limit if "limit" in file.model_fields_set else None
-    return CallableRunner(function, tuple(file.outputs), file.batched, limit)
-
-
-def _umbridge(file: SimulatorFile, folder: Path) -> UmbridgeRunner:
-    if not file.model:
-        raise CalibError(
-            "the model of the server is not named",
-            where="model",
-            expected='model = "NAME"',
-            hint="add it: GET /Info of the server lists them",
-        )
-    rows: Literal["each", "config"] = "each" if file.rows == "each" else "config"
-    return UmbridgeRunner(file.url, file.model, tuple(file.outputs), rows, file.limit)
-
-
-def _of_table(file: SimulatorFile, folder: Path) -> TableRunner:
-    if not file.emulate:
-        raise CalibError(
-            "a table of runs has none where a sampler asks",
-            where="emulate",
-            expected="emulate = true, which is so by itself",
-            hint="leave emulate out",
-        )
-    content = _content(folder / file.table, "table", "table of runs")
-    return TableRunner(folder / file.table, hashlib.sha256(content).hexdigest())

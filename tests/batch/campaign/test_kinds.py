@@ -26,8 +26,9 @@ from calib.inference.io import load_calibration
 from calib.inference.problem import build_problem
 from calib.inference.random import generator
 from calib.models import MODELS, example_csv, get_model
-from calib.models.simulators.declaration import SIMULATED, register_file
+from calib.models.simulators.declaration import SIMULATED
 from calib.models.simulators.emulator import emulator_of, load_emulator
+from calib.models.simulators.files import register_file
 from calib.validation.sbc import run_sbc
 from calib.validation.validate import validate_held_out
 from challenge.make import make

@@ -14,9 +14,9 @@ from calib.errors import CalibError
 from calib.inference.calibration import Calibration
 from calib.inference.emulation import foreseen
 from calib.inference.emulation.prepared import prepare, write_failed
-from calib.inference.emulation.state import EmulationSettings, State
+from calib.inference.emulation.state import State
 from calib.models import MODELS
-from calib.models.simulators.declaration import SIMULATED, Simulated
+from calib.models.simulators.declaration import SIMULATED, EmulationSettings, Simulated
 from calib.models.simulators.simulator import Run, RunKeeper
 from tests.models.simulators.examples import PRIORS, lab, pull
 from tests.registered import forgotten

@@ -91,7 +91,7 @@ def test_settings_of_runs_that_are_made_already_are_refused(tmp_path: Path) -> N
     with pytest.raises(CalibError, match="checks can do nothing for a table"):
         calib.read_simulator(tmp_path / "made.toml")
     runs_table(tmp_path, theta, table(), "emulator = {tolerance = 0.2}")
-    assert calib.read_simulator(tmp_path / "made.toml").budget == {"tolerance": 0.2}
+    assert calib.read_simulator(tmp_path / "made.toml").emulation.tolerance == 0.2
 
 
 def test_a_table_is_judged_where_the_posterior_is(tmp_path: Path) -> None:

@@ -16,12 +16,10 @@ from calib.models import MODELS
 from calib.models.simulators.declaration import (
     SIMULATED,
     from_callable,
-    load_files,
     models_of,
-    read_simulator,
-    register_file,
     simulated_by,
 )
+from calib.models.simulators.files import load_files, read_simulator, register_file
 from calib.models.simulators.runner import UmbridgeRunner
 from tests.models.simulators.examples import PRIORS, lab, pull, write_program
 from tests.registered import forgotten

@@ -19,7 +19,8 @@ import calib
 from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
 from calib.models import MODELS
-from calib.models.simulators.declaration import SIMULATED, read_simulator
+from calib.models.simulators.declaration import SIMULATED
+from calib.models.simulators.files import read_simulator
 from calib.models.simulators.runner import CallableRunner
 from calib.models.simulators.simulator import Failure, RunKeeper, Simulator
 from tests.models.simulators.examples import PRIORS, THETA, X, simulator, write_program

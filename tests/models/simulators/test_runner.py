@@ -19,13 +19,14 @@ import calib
 from calib.errors import CalibError
 from calib.inference.emulation.prepared import read_runs
 from calib.models.base import BoundModel
-from calib.models.simulators.declaration import from_callable, models_of, read_simulator
+from calib.models.simulators.declaration import from_callable, models_of
+from calib.models.simulators.files import read_simulator
+from calib.models.simulators.process import run_program
 from calib.models.simulators.runner import (
     CallableRunner,
     CommandRunner,
     UmbridgeRunner,
     check_template,
-    run_program,
 )
 from calib.models.simulators.simulator import Failure
 from tests.models.simulators.examples import (
@@ -134,8 +135,8 @@ def test_what_the_kernel_cannot_end_is_not_waited_for_for_ever(
 ) -> None:
     asked = []
     stuck = SimpleNamespace(kill=lambda: asked.append(1))
-    monkeypatch.setattr("calib.models.simulators.runner._marked", lambda mark: [stuck])
-    monkeypatch.setattr("calib.models.simulators.runner.KILL_SECONDS", 0.2)
+    monkeypatch.setattr("calib.models.simulators.process._marked", lambda mark: [stuck])
+    monkeypatch.setattr("calib.models.simulators.process.KILL_SECONDS", 0.2)
     assert run_program(python("print('done')"), tmp_path, 20.0) == "done\n"
     assert len(asked) > 1
 
