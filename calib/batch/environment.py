@@ -40,9 +40,10 @@ def from_the_bench(what: str) -> Iterator[None]:
             raise
         raise CalibError(
             "the challenge is a test bench of the repository, not of the wheel",
-            where=what, expected="a checkout of the repository, with its folder `challenge`",
+            where=what,
+            expected="a checkout of the repository, with its folder `challenge`",
             hint="run from a checkout: `pip install -e .` in it",
-        ) from None  # fmt: skip
+        ) from None
 
 
 _PACKAGES = (

@@ -8,13 +8,14 @@ and other processes leave theirs in a folder.
 from __future__ import annotations
 
 import errno
+import json
 import os
 import pickle
 import re
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
@@ -22,15 +23,18 @@ from pathlib import Path
 from calib.batch.constants import ROOM_BYTES, YOUNG_SECONDS
 from calib.errors import CalibError
 
-# Files by which a folder is known to be one of ours, and may be replaced; and what else is in it.
-_OURS = ("manifest.json", "run.json", "diagnosis.json", "score.txt", "audit.json",
-         "comparison.json")  # fmt: skip
-_WRITTEN = (
-    *_OURS, "index.html", "summary.json", "figures", "data", "priors", "gaps", "case",
-    "corrected.json", "document.json", "fresh_prediction.csv", "priors.toml", "data.csv", "tables",
-    "methods.txt", "methods.tex", "references.bib", "audit.csv", "inputs.json", "runs",
-    "emulator.npz", "emulators", "compared", "held_out.csv",
-)  # fmt: skip
+# The record of each kind of folder that may be replaced, and what it does not list of the rest.
+_RECORDS: Mapping[str, tuple[str, ...]] = {
+    "manifest.json": (),
+    "run.json": (),
+    "comparison.json": (),
+    "diagnosis.json": (
+        "document.json", "corrected.json", "fresh_prediction.csv", "inputs.json", "case",
+        "emulators", "index.html", "figures",
+    ),
+    "audit.json": ("audit.csv", "index.html", "figures"),
+    "score.txt": ("levels.png", "reliability_easy.png", "reliability_hard.png"),
+}  # fmt: skip
 # The disk is full, the quota used up, the file system read-only.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 
@@ -424,16 +428,27 @@ def check_folder(out: Path, *, overwrite: bool = False) -> None:
             "exists and is not empty",
             "choose another --out, or pass --overwrite to replace it",
         )
-    if not any((out / name).exists() for name in _OURS):
+    records = [name for name in _RECORDS if (out / name).exists()]
+    if not records:
         raise refuse(
             "was not written by calib, so it is not replaced",
             "choose another --out, or delete the folder yourself",
         )
-    others = sorted(
-        p.name for p in out.iterdir() if p.name not in _WRITTEN and p.suffix not in (".nc", ".png")
-    )
+    written = {name for record in records for name in _written(out, record)}
+    files = (p.relative_to(out) for p in sorted(out.rglob("*")) if not p.is_dir())
+    others = [f.as_posix() for f in files if not {f.as_posix(), f.parts[0]} & written]
     if others:
         raise refuse(
             f"holds files that calib did not write: {', '.join(others[:5])}",
             "move them elsewhere, or choose another --out",
         )
+
+
+def _written(out: Path, record: str) -> set[str]:
+    """Return the files, and the folders, that a folder with a record was written with."""
+    listed: set[str] = set()
+    with suppress(OSError, ValueError, TypeError, AttributeError):  # damaged, it lists nothing
+        content = json.loads((out / record).read_bytes())
+        for key in ("files", "left_out", "sha256"):
+            listed |= set(content.get(key, ()))
+    return {record, *_RECORDS[record], *listed}

@@ -33,12 +33,6 @@ from calib.errors import CalibError
 PLUGINS = "terracalib.plugins"  # entry points of packages that register several things
 USER_MODULE = "calib_user_"  # what the names of modules begin with that were loaded by their paths
 
-# Python, installed packages and this one: their files are taken alone, without what they import.
-_INSTALLED = (
-    *(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib", "purelib")),
-    Path(__file__).resolve().parents[1],
-)
-
 type Loader = Callable[[Path], object]
 
 # Files that this process has loaded, and how; processes that it starts load them too.
@@ -402,10 +396,11 @@ class _Fingerprint(pickle._Pickler):
             return value.__module__, value.__qualname__
         bodies = {k: getattr(v, "__func__", getattr(v, "fget", v)) for k, v in vars(value).items()}
         own = {
-            name: body for name, body in bodies.items()
+            name: body
+            for name, body in bodies.items()
             if (_plain(body) and not name.startswith("__"))
             or (isinstance(body, FunctionType) and not in_file)
-        }  # fmt: skip
+        }
         return value.__qualname__, value.__bases__, own
 
     def _of_function(self, value: FunctionType) -> tuple[Any, ...]:
@@ -436,8 +431,12 @@ class _Fingerprint(pickle._Pickler):
         return True
 
 
+@functools.cache
 def _installed(path: Path) -> bool:
-    return any(path.is_relative_to(folder) for folder in _INSTALLED)
+    """Whether a file is of Python, an installed package or this one, and so taken alone."""
+    places = map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib"))
+    own = Path(__file__).resolve().parents[1]
+    return any(path.is_relative_to(f) for f in (*(Path(p).resolve() for p in places), own))
 
 
 def _plain(value: Any) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import FunctionType
 from typing import Any
@@ -98,6 +99,15 @@ class Registry[T](Mapping[str, T]):
     def discard(self, name: str) -> None:
         """Forget a declaration, if there is one of this name."""
         self._known.pop(name, None)
+
+    @contextmanager
+    def standing_in(self, *declared: T) -> Iterator[None]:
+        """Let declarations take the places of those of their names within a block."""
+        known, self._known = self._known, {**self._all(), **{self._key(d): d for d in declared}}
+        try:
+            yield
+        finally:
+            self._known = known
 
     def _all(self) -> dict[str, T]:
         load_installed(self._group)

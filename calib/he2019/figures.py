@@ -14,8 +14,8 @@ from matplotlib.ticker import NullFormatter
 from calib.data import Table
 from calib.data.quantities import OUTPUTS
 from calib.he2019.audit import Audit
-from calib.he2019.audit.table3 import features
 from calib.he2019.audit.table6 import InverseStudy, attenuation
+from calib.he2019.audit.tables_1_to_4 import features
 from calib.he2019.gaps import FoundGap
 from calib.he2019.published import PUBLISHED
 from calib.models.base import Array
@@ -95,8 +95,9 @@ def _bounds(ax: Axes, audit: Audit) -> None:
         _marks(ax, audit.curvature.least[signs], len(rows) + j, "s", VERMILION,
                "least cost of Table 5's digits, Table 4 optimal", ms=5)  # fmt: skip
         names.append(f"digits of Table 5,\nc9 {'positive' if signs[2] > 0 else 'negative'}")
-    ax.axvline(audit.curvature.published_cost, color=ORANGE, lw=1.4, ls=DASHES[1],
-               label="printed cost")  # fmt: skip
+    ax.axvline(
+        audit.curvature.published_cost, color=ORANGE, lw=1.4, ls=DASHES[1], label="printed cost"
+    )
     _named_rows(ax, names)
     ax.set(xlim=(0.055, 0.16), xticks=[0.06, 0.08, 0.10, 0.12, 0.14], xlabel="Cost, Eq 16 (kN²)")
     ax.set_title("Table 5: where can 0.1050 come from?", loc="left")
@@ -127,9 +128,6 @@ def _named_rows(ax: Axes, names: list[str]) -> None:
     ax.set_ylim(len(names) - 0.5, -0.5)
 
 
-_PULL, _SLIP = "Drawbar pull (kN)", "Slip (%)"
-
-
 def _curve(table: FittedTable, slips: Array, sign: int = 1) -> Array:
     return magic_formula(slips, **{**table.values, "E": sign * table.values["E"]})
 
@@ -139,8 +137,8 @@ def signs_plate(audit: Audit) -> Plate:
     published = audit.published
     rows = (published.geometric, published.genetic)
     fig, axes = panels(
-        2, 3, height=38.0, bottom=17.0, top=6.0, gap_x=10.0, gap_y=8.0, sharex=True, sharey="col",
-    )  # fmt: skip
+        2, 3, height=38.0, bottom=17.0, top=6.0, gap_x=10.0, gap_y=8.0, sharex=True, sharey="col"
+    )
     slips = np.linspace(0.0, 75.0, 301)
     for row, tables in zip(axes, rows, strict=True):
         for ax, table in zip(row, tables.values(), strict=True):
@@ -153,13 +151,14 @@ def signs_plate(audit: Audit) -> Plate:
             ax.set(xlim=(0.0, slips[-1]), ylim=(-0.35 * D, 1.2 * D))
             ax.set_title(f"{table.source}: E = {table.estimates['E'].text}".replace("-", MINUS))
     for ax in axes[-1]:
-        ax.set_xlabel(_SLIP)
+        ax.set_xlabel("Slip (%)")
     for ax in axes[:, 0]:
-        ax.set_ylabel(_PULL)
+        ax.set_ylabel("Drawbar pull (kN)")
     open_ones = [
-        f.where.split(", Eqs")[0] for f in audit.findings
+        f.where.split(", Eqs")[0]
+        for f in audit.findings
         if f.key.endswith("sign_of_E") and f.verdict == "consistent"
-    ]  # fmt: skip
+    ]
     return _plate(fig, audit, "audit_signs", "The signs of E", open_ones=open_ones)
 
 
@@ -175,15 +174,16 @@ def chord_plate(audit: Audit) -> Plate:
         _line(ax, slips, _curve(fitted, slips), BLACK, "Table 4 (genetic algorithm)", lw=1.5)
         _line(ax, reach / steep, reach, BLACK, "its initial slope", lw=0.9, ls=DASHES[2])
         _line(ax, slips, _curve(table, slips), BLUE, "Table 3 (geometric)", lw=1.5, ls=DASHES[1])
-        _line(ax, reach / slope, reach, VERMILION, "BCD of Table 3, printed as initial slope",
-              lw=1.2)  # fmt: skip
+        _line(
+            ax, reach / slope, reach, VERMILION, "BCD of Table 3, printed as initial slope", lw=1.2
+        )
         if found.x_peak is not None:
             _marks(ax, float(found.x_peak.middle), top, "o", ORANGE, "peak of Table 3", ms=6.0,
                    mfc="none", mew=1.4)  # fmt: skip
         ax.set(xlim=(0.0, slips[-1]), ylim=(0.0, 1.15 * max(top, fitted.values["D"])))
         ax.set_title(f"{psi} psi")
-        ax.set_xlabel(_SLIP)
-    axes[0, 0].set_ylabel(_PULL)
+        ax.set_xlabel("Slip (%)")
+    axes[0, 0].set_ylabel("Drawbar pull (kN)")
     return _plate(fig, audit, "audit_chord", "The slope of Table 3")
 
 
@@ -193,8 +193,9 @@ def digits_plate(audit: Audit) -> Plate:
     fig, axes = panels(1, 3, height=50.0, bottom=17.0, top=6.0, gap_x=4.0, sharey=True)
     for ax, psi in zip(axes[0], study.allowed, strict=True):
         allowed, table4 = study.allowed[psi], study.table4[psi]
-        _band(ax, study.slips, allowed.lower, allowed.upper,
-              "all coefficients that print as Table 5")  # fmt: skip
+        _band(
+            ax, study.slips, allowed.lower, allowed.upper, "all coefficients that print as Table 5"
+        )
         for edge in (allowed.lower, allowed.upper):
             _line(ax, study.slips, edge, BLUE, lw=0.6)
         curve = study.as_printed[psi]
@@ -206,9 +207,9 @@ def digits_plate(audit: Audit) -> Plate:
         note(ax, f"open by ±{short(open_by)} % of D", x=0.97, y=0.04)
         ax.set_title(f"{psi} psi")
         ax.set_xlim(0.0, study.slips[-1])
-        ax.set_xlabel(_SLIP)
+        ax.set_xlabel("Slip (%)")
     axes[0, 0].set_ylim(0.0, None)
-    axes[0, 0].set_ylabel(_PULL)
+    axes[0, 0].set_ylabel("Drawbar pull (kN)")
     return _plate(fig, audit, "audit_digits", "What the digits of Table 5 leave open")
 
 
@@ -221,10 +222,11 @@ def rut_plate(audit: Audit) -> Plate:
     for ax, draw in zip(axes.flat, (_points, _exponents, _by_pressure, _held_out), strict=True):
         draw(ax, audit)
     titles = (
-        "How many points were fitted?", "Exponents: Eq 22 and the likelihood",
+        "How many points were fitted?",
+        "Exponents: Eq 22 and the likelihood",
         f"Ruts brought to {100 * _AT_SLIP:g} % slip",
         f"Rut at {audit.published.setup.held_out_psi} psi, not fitted",
-    )  # fmt: skip
+    )
     for ax, title in zip(axes.flat, titles, strict=True):
         ax.set_title(title, loc="left")
     return _plate(fig, audit, "audit_rut", "Table 6: points, exponents and prediction")
@@ -232,8 +234,9 @@ def rut_plate(audit: Audit) -> Plate:
 
 def _points(ax: Axes, audit: Audit) -> None:
     study = audit.quality
-    _band(ax, study.n, study.implied.lower, study.implied.upper,
-          "from R² and RMSE, digits propagated")  # fmt: skip
+    _band(
+        ax, study.n, study.implied.lower, study.implied.upper, "from R² and RMSE, digits propagated"
+    )
     contact = float(study.from_contact.middle)
     ax.axhline(contact, color=BLACK, lw=1.1, label="from the contact lengths")
     ax.axvline(study.assumed_n, color=GREY, lw=0.8, ls=DASHES[2])
@@ -317,7 +320,7 @@ def _held_out(ax: Axes, audit: Audit) -> None:
     _line(ax, slip, study.published_30, ORANGE, lw=1.6, ls=DASHES[1])
     _marks(ax, slip, study.held_out["rut_depth_mm"], "o", VERMILION,
            "reconstructed, 30 psi (held out)", mfc="white", ms=5.0, mew=1.3)  # fmt: skip
-    ax.set(xlabel=_SLIP, ylabel="Rut depth (mm)")
+    ax.set(xlabel="Slip (%)", ylabel="Rut depth (mm)")
 
 
 def audit_plates(audit: Audit) -> list[Plate]:
@@ -331,10 +334,6 @@ def audit_plates(audit: Audit) -> list[Plate]:
 
 # The source's gaps
 
-# Quantile of the ends of a 90 % band.
-_Z_90 = 1.645
-_LEFT_OPEN: dict[str, Any] = {"lw": 0.8, "ls": (0, (4, 2)), "zorder": 1}
-
 
 @style()
 def gap_plate(result: FoundGap) -> Plate:
@@ -346,6 +345,8 @@ def gap_plate(result: FoundGap) -> Plate:
         box = ax.get_position()
         ax.set_position((left / DOUBLE_MM, box.y0, width / DOUBLE_MM, box.height))
     before, after, which = axes[0]
+    z_90 = 1.645  # quantile of the ends of a 90 % band
+    left_open: dict[str, Any] = {"lw": 0.8, "ls": (0, (4, 2)), "zorder": 1}
     conditions, x_axis = result.found.data.view.conditions, axis_of("slip_ratio")
     x = x_axis.scale(conditions["slip_ratio"][own.rows])
     pressure = conditions["inflation_pressure_psi"][own.rows]
@@ -356,19 +357,19 @@ def gap_plate(result: FoundGap) -> Plate:
         _marks(after, x[at], (own.measured - own.after)[at], *mark, f"{psi:g} psi", mec="white",
                mew=0.4, ms=4.6, zorder=3)  # fmt: skip
         order = np.argsort(x[at])
-        for z in (-_Z_90, _Z_90):
-            _line(before, x[at][order], z * result.open_sd[at][order], mark[1], **_LEFT_OPEN)
+        for z in (-z_90, z_90):
+            _line(before, x[at][order], z * result.open_sd[at][order], mark[1], **left_open)
     if kept_out is not None:
         _neither_campaign(before, after, kept_out, result)
     # 90 % of the noise about zero; a straight line through the rows' own, as it may grow.
     ends = np.array([x.min(), x.max()])
-    level = _Z_90 * np.polyval(np.polyfit(x, own.noise, 1), ends)
+    level = z_90 * np.polyval(np.polyfit(x, own.noise, 1), ends)
     for ax in (before, after):
         ax.fill_between(ends, -level, level, color="#e6e6e6", lw=0.0, zorder=0,
                         label="90 % of the noise" if ax is after else None)  # fmt: skip
         ax.axhline(0.0, color=GREY, lw=0.6, zorder=1)
         ax.set_xlabel(x_axis.label)
-    _line(after, [], [], GREY, "90 % of what the calibration left open", **_LEFT_OPEN)
+    _line(after, [], [], GREY, "90 % of what the calibration left open", **left_open)
     heights = [end for ax in (before, after) for end in ax.get_ylim()]
     for ax in (before, after):
         ax.set_ylim(min(heights), max(heights))

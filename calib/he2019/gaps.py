@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import hashlib
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
@@ -49,14 +49,8 @@ from calib.report.study import Progress
 
 RECONSTRUCTED = "the data are reconstructed from published results; they are not measurements"
 
-_COLUMNS = {
-    "bekker": ("inflation_pressure_psi", "average_ground_pressure_kpa", "slip_ratio",
-               "rut_depth_mm"),
-    "magic_formula_pressure": ("inflation_pressure_psi", "slip_ratio", "drawbar_pull_kn"),
-}  # fmt: skip
-_PULL = "magic_formula_pressure"
-
 type Mask = NDArray[np.bool_]
+type Made = tuple[Case, Table | None]  # and the rows kept out of both campaigns
 
 
 @dataclass(frozen=True)
@@ -83,67 +77,40 @@ class PaperGap:
 @cache
 def paper_gaps() -> tuple[PaperGap, ...]:
     """Return the four gaps, made from the embedded data."""
-    return (_plain_bekker(), _nominal_slip(), _held_out_pull(), _post_peak())
-
-
-def _gap(
-    case: Case, unfitted: Table | None = None, variants: Mapping[str, Case] | None = None
-) -> PaperGap:
-    said = {key: " ".join(text.split()) for key, text in declared("gaps.toml")[case.name].items()}
-    return PaperGap(case.name, case=case, unfitted=unfitted, variants=variants or {}, **said)
-
-
-def _plain_bekker() -> PaperGap:
-    data = load_he2019("rut_depth")
+    rut, pull = load_he2019("rut_depth"), load_he2019("drawbar_pull")
     # The wheel hardly slips at the two smallest nominal slips, 0 and 2.5 %.
-    towed, at_30 = data["slip_ratio"] < 0.03, data["inflation_pressure_psi"] == 30.0
-    return _gap(*_case("plain_bekker", "bekker", data, ~towed & ~at_30, ~towed & at_30))
-
-
-def _nominal_slip() -> PaperGap:
-    data = load_he2019("drawbar_pull")
+    towed, at_30 = rut["slip_ratio"] < 0.03, rut["inflation_pressure_psi"] == 30.0
+    bekker = _case("plain_bekker", rut, ~towed & ~at_30, ~towed & at_30)
+    at_18, at_30 = (pull["inflation_pressure_psi"] == psi for psi in (18.0, 30.0))
+    level = np.unique(pull["slip_ratio"], return_inverse=True)[1]
     # By the order of the slips at each pressure; the field has the row at nominal zero.
-    first = _slip_level(data) % 2 == 0
-    at_30 = data["inflation_pressure_psi"] == 30.0
-
-    def case(name: str, there: Mask, *, nominal: bool) -> tuple[Case, Table | None]:
-        return _case(name, _PULL, data, there & ~at_30, there & at_30, nominal=nominal)
-
-    variants = {
-        "halves swapped": case("nominal_slip_swapped", ~first, nominal=True)[0],
-        "slips given back": case("nominal_slip_given_back", first, nominal=False)[0],
-    }
-    return _gap(*case("nominal_slip", first, nominal=True), variants)
-
-
-def _held_out_pull() -> PaperGap:
-    data = load_he2019("drawbar_pull")
-    return _gap(*_case("held_out_pull", _PULL, data, data["inflation_pressure_psi"] == 30.0))
-
-
-def _post_peak() -> PaperGap:
-    data = load_he2019("drawbar_pull")
-    at_18 = data["inflation_pressure_psi"] == 18.0
-    level = _slip_level(data)
-    peak = int(level[at_18][np.argmax(data["drawbar_pull_kn"][at_18])])
-    found, later, latest = (
-        _case(name, _PULL, data, at_18 & (level > peak + i))[0]
+    first = level % 2 == 0
+    slip = _case("nominal_slip", pull, first & ~at_30, first & at_30, nominal=True)
+    swapped = _case("nominal_slip_swapped", pull, ~first & ~at_30, ~first & at_30, nominal=True)
+    back = _case("nominal_slip_given_back", pull, first & ~at_30, first & at_30)
+    peak = int(level[at_18][np.argmax(pull["drawbar_pull_kn"][at_18])])
+    past, later, latest = (
+        _case(name, pull, at_18 & (level > peak + i))
         for i, name in enumerate(("post_peak_18_psi", "post_peak_later", "post_peak_latest"))
     )
     begins = "field begins {} later".format
-    variants = {begins("one slip level"): later, begins("two slip levels"): latest}
-    return _gap(found, variants=variants)
+    return (
+        _gap(bekker),
+        _gap(slip, {"halves swapped": swapped, "slips given back": back}),
+        _gap(_case("held_out_pull", pull, at_30)),
+        _gap(past, {begins("one slip level"): later, begins("two slip levels"): latest}),
+    )
 
 
-def _slip_level(data: Table) -> NDArray[np.int64]:
-    """Return the place of each row's slip among the slips tested, from 0."""
-    return np.unique(data["slip_ratio"], return_inverse=True)[1].astype(np.int64)
+def _gap(made: Made, variants: Mapping[str, Made] | None = None) -> PaperGap:
+    (case, unfitted), others = made, {name: v[0] for name, v in (variants or {}).items()}
+    said = {key: " ".join(text.split()) for key, text in declared("gaps.toml")[case.name].items()}
+    return PaperGap(case.name, case=case, unfitted=unfitted, variants=others, **said)
 
 
 def _case(
-    name: str, model: str, data: Table, there: Mask, kept_out: Mask | None = None, *,
-    nominal: bool = False,
-) -> tuple[Case, Table | None]:  # fmt: skip
+    name: str, data: Table, there: Mask, kept_out: Mask | None = None, *, nominal: bool = False
+) -> Made:
     """Make a case of embedded data whose field is the rows `there`, and its laboratory the rest.
 
     Rows kept out of both are returned apart, in the case by their conditions. `nominal` puts
@@ -153,16 +120,20 @@ def _case(
     def rows(mask: Mask, file: str, *, nominal: bool) -> Table:
         return _table(
             {n: data["nominal_slip_ratio" if nominal and n == "slip_ratio" else n][mask]
-             for n in _COLUMNS[model]}, file,
+             for n in data if n != "nominal_slip_ratio"}, file,
         )  # fmt: skip
 
     unfitted = new = None
-    lab, output = ~there, _COLUMNS[model][-1]
+    lab, output = ~there, [*data][-1]
     if kept_out is not None:
         lab &= ~kept_out
         unfitted = rows(kept_out, "fresh.csv", nominal=nominal)
         new = _table({n: v for n, v in unfitted.columns.items() if n != output}, "fresh.csv")
-    models = {next(key for key, column in OUTPUTS.items() if column == output): model}
+    models = (
+        {"rut_depth": "bekker"}
+        if output == OUTPUTS["rut_depth"]
+        else {"drawbar_pull": "magic_formula_pressure"}
+    )
     case = Case(
         name, rows(lab, "lab.csv", nominal=False), rows(there, "field.csv", nominal=nominal),
         models, new, (RECONSTRUCTED,),
@@ -189,9 +160,10 @@ def write_cases(gaps: Sequence[PaperGap], out: Path, *, overwrite: bool = False)
     existing = [folder.name for folder in folders if folder.exists()]
     if existing and not overwrite:
         raise CalibError(
-            f"{', '.join(existing)} exist there already", where=str(out),
+            f"{', '.join(existing)} exist there already",
+            where=str(out),
             hint="choose another --out, or pass --overwrite",
-        )  # fmt: skip
+        )
     for gap, folder in zip(gaps, folders, strict=True):
         folder.mkdir(parents=True, exist_ok=True)
         write_table(folder / "lab.csv", gap.case.lab.columns)
@@ -303,7 +275,11 @@ type Checks = dict[str, dict[str, float]]
 
 def checks(result: FoundGap) -> Checks:
     """Return the comparisons of a gap in reading order: numbers by names with their units."""
-    own = _OWN[result.gap.name](result)
+    of_gap = {
+        "plain_bekker": _bekker_checks, "nominal_slip": _slip_checks,
+        "held_out_pull": _pull_checks, "post_peak_18_psi": _peak_checks,
+    }  # fmt: skip
+    own = of_gap[result.gap.name](result)
     unfitted, output = result.gap.unfitted, result.output
     if unfitted is None:
         return own
@@ -314,8 +290,9 @@ def checks(result: FoundGap) -> Checks:
     values = {
         "rows": float(measured.size),
         "in_90_band": float(((measured >= p.lower) & (measured <= p.upper)).sum()),
-        f"rmse_before_{unit}": _rms(before), f"rmse_after_{unit}": _rms(after),
-    }  # fmt: skip
+        f"rmse_before_{unit}": _rms(before),
+        f"rmse_after_{unit}": _rms(after),
+    }
     if output == "rut_depth":  # a pull near zero has no relative error to speak of
         published = PUBLISHED.rut_depth.quality["held_out_max_relative_error"].value
         values |= {
@@ -388,14 +365,15 @@ def _pull_checks(result: FoundGap) -> Checks:
     measured = found.data.case.field[OUTPUTS[o.name]][o.rows]
     return {
         "miss_against_what_was_open": {
-            "miss_rms_kn": _rms(measured - before), "simulator_sd_rms_kn": _rms(result.open_sd),
+            "miss_rms_kn": _rms(measured - before),
+            "simulator_sd_rms_kn": _rms(result.open_sd),
             "noise_sd_kn": none.noise[o.name].sigma,
         },
         "no_effect_fitted_to_all": {
             "miss_rms_kn": _rms(measured - refitted),
             "largest_bend_prior_sd": float(np.max(np.abs(moved))),
         },
-    }  # fmt: skip
+    }
 
 
 def _peak_checks(result: FoundGap) -> Checks:
@@ -439,12 +417,6 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-_OWN: Mapping[str, Callable[[FoundGap], Checks]] = {
-    "plain_bekker": _bekker_checks, "nominal_slip": _slip_checks,
-    "held_out_pull": _pull_checks, "post_peak_18_psi": _peak_checks,
-}  # fmt: skip
-
-
 def summarise_gaps(results: Sequence[FoundGap]) -> dict[str, Any]:
     """Return verdict, probabilities, rows, checks and variants as plain dictionaries by gap."""
     return {
@@ -458,13 +430,12 @@ def summarise_gaps(results: Sequence[FoundGap]) -> dict[str, Any]:
             **answer(contract(result.document)),
             "open_sd_rms": float((result.open_sd**2).mean() ** 0.5),
             "checks": checks(result),
-            "variants": {name: _answer(other) for name, other in result.variants.items()},
+            "variants": {
+                name: {"verdict": v.verdict, "probability": {n: p[n] for n in v.ranking.order}}
+                for name, v in result.variants.items()
+                for p in [v.ranking.probability]
+            },
             "warnings": list(result.found.warnings),
         }
         for result in results
     }
-
-
-def _answer(found: Diagnosis) -> dict[str, Any]:
-    p = found.ranking.probability
-    return {"verdict": found.verdict, "probability": {n: float(p[n]) for n in found.ranking.order}}

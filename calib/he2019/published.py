@@ -107,27 +107,28 @@ PUBLISHED = Published(
 )
 
 
-_TABLES = {
-    "ayers_perumpral": PUBLISHED.bulk_density, "magic_formula_pressure": PUBLISHED.pressure,
-    "modified_bekker": PUBLISHED.rut_depth,
-}  # fmt: skip
-
-
 class _He2019(Reference):
     """The tables of He, Sandu & Osorio (2019)."""
 
     label = LABEL
     alone: ClassVar[Mapping[str, Mapping[int, FittedTable]]] = {
-        "geometric": PUBLISHED.geometric, "genetic": PUBLISHED.genetic,
-    }  # fmt: skip
+        "geometric": PUBLISHED.geometric,
+        "genetic": PUBLISHED.genetic,
+    }
 
     def table(self, model: str) -> FittedTable | None:
         """Return the published table of a model, if there is one."""
-        return _TABLES.get(model)
+        own = {
+            "ayers_perumpral": PUBLISHED.bulk_density,
+            "magic_formula_pressure": PUBLISHED.pressure,
+            "modified_bekker": PUBLISHED.rut_depth,
+        }
+        return own.get(model)
 
     def quality(self, model: str) -> Mapping[str, Figure]:
         """Return the published goodness of fit; Table 6 gives that of ln pgr, ours is of ln z."""
-        return {} if model not in _TABLES or model == "modified_bekker" else _TABLES[model].quality
+        table = self.table(model)
+        return {} if table is None or model == "modified_bekker" else table.quality
 
     def curve(self, model: str, conditions: Mapping[str, Array]) -> tuple[Array, str] | None:
         """Return the published fit at given conditions, and the table it follows from.

@@ -71,9 +71,10 @@ def nearest_errors(
 
     def constraint(kind: str, conditions: Conditions) -> dict[str, Any]:
         return {
-            "type": kind, "fun": lambda errors: conditions(errors)[0],
+            "type": kind,
+            "fun": lambda errors: conditions(errors)[0],
             "jac": lambda errors: conditions(errors)[1],
-        }  # fmt: skip
+        }
 
     def distance(errors: Array) -> float:
         return float(np.sum((errors - drawn) ** 2))
@@ -93,18 +94,7 @@ def nearest_errors(
     return np.asarray(found.x, dtype=np.float64)
 
 
-def read_only(**columns: Array) -> dict[str, Array]:
-    """Return columns that cannot be written to, since they are shared between callers."""
-    for column in columns.values():
-        column.flags.writeable = False
-    return columns
-
-
 # Bulk density
-
-# C2 has a standard error of 20 and is printed to 0.001, C1 is known to a factor of 10^30 and
-# printed to 1 in 10^4: all printed digits return only if densities are written to 1e-8 g/cm^3.
-DENSITY_DECIMALS = 8
 
 
 def _design(rng: np.random.Generator, variance: float) -> tuple[Array, Array]:
@@ -171,10 +161,11 @@ def bulk_density() -> dict[str, Array]:
     extreme = np.sign(drawn[worst]) * quality["max_relative_error"]
     lower[worst] = upper[worst] = fitted[worst] / (1.0 - extreme) - fitted[worst]
     density = fitted + nearest_errors(drawn, equal, lower, upper)
-    return read_only(
-        cone_index_kpa=index, gravimetric_water_content=water,
-        bulk_density_g_cm3=np.round(density, DENSITY_DECIMALS),
-    )  # fmt: skip
+    return {
+        "cone_index_kpa": index,
+        "gravimetric_water_content": water,
+        "bulk_density_g_cm3": density,
+    }
 
 
 # Drawbar pull
@@ -186,10 +177,6 @@ NOMINAL_SLIPS = (
 
 SLIP_SHIFT = 0.02
 """Assumed: the source shifts slips until the pull is zero at zero slip, not saying how far."""
-
-# E at 42 psi has a standard error of 6 and is printed to 0.0001: all printed digits return only if
-# pulls are written to 1e-7 kN or better.
-PULL_DECIMALS = 8
 
 
 class _Setting(NamedTuple):
@@ -265,29 +252,23 @@ def drawbar_pull() -> dict[str, Array]:
         curve = magic_formula(100.0 * slip, **table.values)
         pulls.append(curve + _errors(psi, 100.0 * slip, drawn))
     repeats = len(_SETTINGS)
-    return read_only(
-        inflation_pressure_psi=np.repeat(np.array(list(_SETTINGS), dtype=np.float64), slip.size),
-        nominal_slip_ratio=np.tile(nominal, repeats),
-        slip_ratio=np.round(np.tile(slip, repeats), 3),
-        drawbar_pull_kn=np.round(np.concatenate(pulls), PULL_DECIMALS),
-    )
+    return {
+        "inflation_pressure_psi": np.repeat(np.array([*_SETTINGS], dtype=np.float64), slip.size),
+        "nominal_slip_ratio": np.tile(nominal, repeats),
+        "slip_ratio": np.tile(slip, repeats),
+        "drawbar_pull_kn": np.concatenate(pulls),
+    }
 
 
 # Rut depth
 
 SLIPS = (0.0, 0.025, 0.05, 0.075, 0.10, 0.125, 0.15, 0.175, 0.20)
 
-# Of ruts in mm: five decimals return k to its printed 1 in 10^4 with a wide margin.
-RUT_DECIMALS = 5
-
-_FITTED = (18, 42)
-
 _QUALITY = {name: figure.value for name, figure in PUBLISHED.rut_depth.quality.items()}
 
 
 def _sse() -> float:
-    degrees_of_freedom = len(_FITTED) * len(SLIPS) - len(PUBLISHED.rut_depth.estimates)
-    return _QUALITY["rmse"] ** 2 * degrees_of_freedom
+    return _QUALITY["rmse"] ** 2 * (2 * len(SLIPS) - len(PUBLISHED.rut_depth.estimates))
 
 
 def ground_pressure() -> dict[int, float]:
@@ -298,10 +279,10 @@ def ground_pressure() -> dict[int, float]:
         - float(np.log(setup.contact_width_mm.value * length.value))
         for psi, length in setup.contact_length_mm.items()
     }
-    low, high = (log[psi] for psi in _FITTED)
+    low, high = log[18], log[42]
     # Two pressures, equally often: the total sum of squares is n (difference/2)^2.
     total = _sse() / (1.0 - _QUALITY["r_squared"])
-    difference = 2.0 * np.sqrt(total / (len(_FITTED) * len(SLIPS)))
+    difference = 2.0 * np.sqrt(total / (2 * len(SLIPS)))
     centre, ratio = 0.5 * (low + high), difference / (high - low)
     return {
         psi: round(float(np.exp(centre + ratio * (value - centre))), 2)
@@ -362,7 +343,9 @@ def rut_depth() -> dict[str, Array]:
     rut = np.empty_like(psi)
     rut[~held_out] = _fitted_ruts(rng, pressure[~held_out], slip[~held_out])
     rut[held_out] = _held_out_ruts(rng, pressure[held_out], slip[held_out])
-    return read_only(
-        inflation_pressure_psi=psi, average_ground_pressure_kpa=pressure, slip_ratio=slip,
-        rut_depth_mm=np.round(1000.0 * rut, RUT_DECIMALS),
-    )  # fmt: skip
+    return {
+        "inflation_pressure_psi": psi,
+        "average_ground_pressure_kpa": pressure,
+        "slip_ratio": slip,
+        "rut_depth_mm": 1000.0 * rut,
+    }

@@ -48,7 +48,10 @@ def remarks_of(calibration: Calibration) -> tuple[Remark, ...]:
         *(remark("outlying", note=note) for note in outlying_notes(problem, t)),
         *file_remarks(problem, float(problem.theta(t[None])[0, -1])),
         *((remark("unit_first"),) if any(column_notes(problem.table)) else ()),
-        *_pressed(calibration),
+        *(
+            remark("pressed", name=n, bound=plain_number(b), beyond=_beyond(calibration, n))
+            for n, b in _bounds_pressed(calibration).items()
+        ),
         *cut_off(problem, calibration.draws.flat),
     )
 
@@ -116,12 +119,6 @@ def _bounds_pressed(calibration: Calibration) -> dict[str, float]:
             if np.isfinite(bound) and bound != prior.loc and near.mean() > 0.1:
                 found[prior.name] = float(np.exp(bound) if prior.log else bound)
     return found
-
-
-def _pressed(calibration: Calibration) -> Iterator[Remark]:
-    for name, bound in _bounds_pressed(calibration).items():
-        beyond = _beyond(calibration, name)
-        yield remark("pressed", name=name, bound=plain_number(bound), beyond=beyond)
 
 
 def _beyond(calibration: Calibration, name: str) -> str:

@@ -31,6 +31,7 @@ from calib.inference.sampler import Progress, SamplerSettings
 from calib.models import get_model
 from calib.models.base import Array
 from calib.validation.constants import CLEAR, SMALL
+from calib.validation.residuals import WORDS
 from calib.validation.validate import Validation, leave_one_out, validate_held_out
 
 type ComparisonProgress = Callable[[str, int, int], None]
@@ -310,28 +311,13 @@ class NoisePreference:
     @property
     def sentence(self) -> str:
         """What was found, in plain words."""
-        chosen, usual = noise_words(self.noise), "normal noise of one standard deviation"
-        if self.preferred == "unknown":
-            return (
-                f"Whether {chosen} is preferred to {usual} cannot be said: one of the posteriors "
-                "that this rests on did not converge, or gives a row that was left out no density."
-            )
-        said = {
-            "neither": f"The data cannot tell {chosen} from {usual}",
-            "chosen": f"The data prefer {chosen} to {usual}",
-            "normal": f"The data prefer {usual} to {chosen}",
-        }[self.preferred]
-        places = 1 if self.se >= 0.1 else 2
-        text = (
-            f"{said} (elpd by leave-one-out {self.elpd:+.{places}f}, standard error "
-            f"{self.se:.{places}f})."
-        )
-        if self.line and abs(self.elpd) > SMALL:
-            text += (
-                f" More than half of that is line {self.line} of the file alone, so that the "
-                "standard error says little: look at this reading first."
-            )
-        return text
+        words, places = WORDS["noise_preference"], 1 if self.se >= 0.1 else 2
+        text: str = words[self.preferred].format(
+            chosen=noise_words(self.noise), elpd=f"{self.elpd:+.{places}f}",
+            se=f"{self.se:.{places}f}",
+        )  # fmt: skip
+        alone = self.line and abs(self.elpd) > SMALL and self.preferred != "unknown"
+        return text + (words["one_line"].format(line=self.line) if alone else "")
 
 
 def noise_words(noise: Noise) -> str:
@@ -379,9 +365,10 @@ def noise_preference(
     )  # fmt: skip
     parts = [
         leave_one_out(c, settings=settings, progress=progress, workers=workers)
-        if done is None else done
+        if done is None
+        else done
         for c, done in ((calibration, loo), (usual, None))
-    ]  # fmt: skip
+    ]
     better = _rows_of(parts[0]) - _rows_of(parts[1])
     if not np.isfinite(better).all():
         return NoisePreference(problem.noise, float("nan"), float("nan"), sound=False)

@@ -107,8 +107,9 @@ def predict_stacked(parts: Sequence[tuple[float, Calibration]], table: Table) ->
     whole = np.concatenate(means)
     share = np.isfinite(whole).mean(axis=0)
     kept = np.where(share >= MIN_DEFINED, 0.0, np.nan)
-    flags = (tuple(dict.fromkeys(name for f in row for name in f))
-             for row in zip(*outer, strict=True))  # fmt: skip
+    flags = (
+        tuple(dict.fromkeys(name for f in row for name in f)) for row in zip(*outer, strict=True)
+    )
     return Prediction(
         used[0][1].problem.bound.model.output, conditions, bands(whole + kept),
         bands(np.concatenate(measured) + kept), tuple(flags), share,

@@ -63,13 +63,7 @@ class Design:
 
 @dataclass(frozen=True)
 class ModelDesign:
-    """Where a model is measured, unless at the conditions of its own example.
-
-    Parameters
-    ----------
-    make : callable
-        ``() -> Design``.
-    """
+    """Where a model is measured, as `make` returns it, unless at those of its own example."""
 
     model: str
     make: Callable[[], Design]
@@ -116,21 +110,11 @@ def _of_file(model: Model, path: Path, where: str) -> Design:
 
 @dataclass(frozen=True)
 class Simulated:
-    """A campaign whose truth is known.
+    """A campaign whose truth, (d,) in internal coordinates, is known, and its calibration.
 
-    Parameters
-    ----------
-    truth : ndarray, shape (d,)
-        Internal coordinates.
-    problem : Problem
-        Of the simulated calibration data.
-    held : mapping of str to ndarray, shape (m,)
-        Conditions of the held-out rows.
-    location, measured : ndarray, shape (m,)
-        At the held-out rows: the model's output at the truth, and a measurement of it; NaN where
-        the model has no value.
-    attempts : int
-        Draws from the prior until the model had a value at every row.
+    Held out are m rows: their conditions, the model's output at the truth and a measurement of it,
+    NaN where the model has no value. `attempts` counts draws from the prior until the model had a
+    value at every row.
     """
 
     truth: Array
@@ -189,19 +173,6 @@ def _measured(
         return back(location), back(location + noise[0])
 
 
-@dataclass(frozen=True)
-class _Runs:
-    """An equation that makes a run for each parameter vector; those that fail have no value."""
-
-    keeper: RunKeeper
-    output: str
-
-    def __call__(self, theta: Array, conditions: Conditions) -> Array:
-        empty = np.full(next(iter(conditions.values())).shape[-1], np.nan)
-        runs = self.keeper.runs(theta, conditions)
-        return np.stack([run.outputs[self.output] if run.ok else empty for run in runs])
-
-
 def most_runs(model: str, found: SlowSimulator, design: Design, simulations: int) -> str:
     """Say how many runs of a slow simulator so many campaigns may take.
 
@@ -213,9 +184,10 @@ def most_runs(model: str, found: SlowSimulator, design: Design, simulations: int
     if not found.simulator.runner.runs:
         raise CalibError(
             f"{model} is a table of runs already made: there is none at the truths that are drawn",
-            where=f"simulator {found.name}", expected="a simulator that can be run",
+            where=f"simulator {found.name}",
+            expected="a simulator that can be run",
             hint="declare the program that made the table, or leave the model out",
-        )  # fmt: skip
+        )
     settings = found.emulation
     free = len(build_problem(model, design.table).priors.free) - 1
     # Without a folder nothing is kept from one campaign to the next.
@@ -294,7 +266,13 @@ def simulated(item: Item) -> Simulated:
     # Truths and their data are drawn from the simulator itself.
     model = template.bound.model
     keeper = RunKeeper(slow.simulator, slow.folder, item.workers, item.scheduler)
-    runs = replace(model, predict=_Runs(keeper, model.output), mean_response=None)
+
+    def by_runs(theta: Array, conditions: Conditions) -> Array:
+        empty = np.full(next(iter(conditions.values())).shape[-1], np.nan)
+        made = keeper.runs(theta, conditions)
+        return np.stack([run.outputs[model.output] if run.ok else empty for run in made])
+
+    runs = replace(model, predict=by_runs, mean_response=None)
     asking = replace(template, bound=replace(template.bound, model=runs))
     # At least half of the prior has to have a value, or the emulation refuses.
     found = simulate(asking, design, rng, attempts=50)

@@ -26,7 +26,7 @@ from calib.models.base import Array
 from calib.validation.constants import FEWEST, FEWEST_IN_GROUP, LEVEL, OUTLYING_LEVEL
 from calib.validation.scores import holm
 
-_WORDS = tomllib.loads(Path(__file__).with_name("remarks.toml").read_text(encoding="utf-8"))
+WORDS = tomllib.loads(Path(__file__).with_name("remarks.toml").read_text(encoding="utf-8"))
 
 
 class Range(NamedTuple):
@@ -77,7 +77,7 @@ class Check(NamedTuple):
 
 def remark(kind: str, *, where: tuple[Range, ...] = (), **fields: Any) -> Remark:
     """Return the remark of a kind, a heading of `remarks.toml`, with the fields of its text."""
-    words = _WORDS[kind]
+    words = WORDS[kind]
     text = words["text"].format(**fields)
     return Remark(text, words.get("title", ""), words.get("shifts", False), where)
 
@@ -275,9 +275,10 @@ def _uneven(problem: Problem, residual: Array) -> Iterator[Check]:
             continue
         quantity, column = QUANTITIES[name], problem.table.column(name)
         words: dict[str, Any] = {
-            "source": source_of(problem.table), "stem": quantity.stem,
+            "source": source_of(problem.table),
+            "stem": quantity.stem,
             "word": word_of(problem.table, quantity),
-        }  # fmt: skip
+        }
         if count.min() < FEWEST_IN_GROUP:
             found = scipy.stats.kendalltau(np.abs(score), values)
             grows = "grows" if found.statistic > 0.0 else "falls"

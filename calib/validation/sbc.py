@@ -223,7 +223,8 @@ def score(
         why = next(iter(errors.values()), "none was done")
         raise CalibError(f"no simulated campaign could be calibrated: {why}")
     return SbcScore(
-        seed, simulations,
+        seed,
+        simulations,
         tuple(
             score_model(
                 [r for r in records if r["model"] == model],
@@ -231,7 +232,7 @@ def score(
             )
             for model in models
         ),
-    )  # fmt: skip
+    )
 
 
 def score_model(
@@ -329,8 +330,9 @@ def run_sbc(
     if unused := [model for model in given if model not in names]:
         raise CalibError(
             f"there are priors of {', '.join(unused)}, which is not among the models",
-            expected=", ".join(names), hint="name it with --model, or leave its priors out",
-        )  # fmt: skip
+            expected=", ".join(names),
+            hint="name it with --model, or leave its priors out",
+        )
     said: dict[str, Any] = (
         {"priors": {model: p.text for model, p in given.items()}} if given else {}
     )
@@ -357,18 +359,14 @@ def run_sbc(
         replicate, items, out / "replicates", **({} if slow else spread),
         progress=progress, announce=announce,
     )  # fmt: skip
-    return score(read_records(out, outcome.done), seed, simulations, outcome.failed)
+    records = [json.loads((out / "replicates" / f"{n}.json").read_bytes()) for n in outcome.done]
+    return score(records, seed, simulations, outcome.failed)
 
 
 def chosen_models(models: Sequence[str] = ()) -> list[str]:
     """Return the names of models, which must be known; of all that are not slow by default."""
     named = [get_model(name).name for name in models]
     return named or [m.name for m in MODELS.values() if not m.slow]
-
-
-def read_records(out: Path, names: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the records of some replicates of a run."""
-    return [json.loads((out / "replicates" / f"{name}.json").read_bytes()) for name in names]
 
 
 def _claim(out: Path, run: dict[str, Any]) -> None:

@@ -1,6 +1,6 @@
 """Whatever a file holds, it is read or refused with a `CalibError`: thousands of mutilated files.
 
-`make test` tries 25 of each kind, `make test-slow` 30,000 together, and says how many.
+`make test` tries 15 of each kind, `make test-slow` 30,000 together, and says how many.
 Command lines as well: each ends in an exit code and words, never in a traceback.
 """
 
@@ -32,7 +32,7 @@ from calib.models.simulators.declaration import models_of
 from calib.models.simulators.files import read_simulator
 from tests.models.simulators.examples import PROGRAM, write_program
 
-FEW, MANY = 25, 5_000
+FEW, MANY = 15, 5_000
 
 # What turns up in files, by accident or by malice.
 TOKENS = (
@@ -65,9 +65,8 @@ def mutilated(draw: st.DrawFn, texts: Sequence[str]) -> str:
 
 def everything(count: int) -> Callable[[Callable[..., None]], Callable[..., None]]:
     return settings(
-        max_examples=count, deadline=None, database=None,
-        suppress_health_check=list(HealthCheck),
-    )  # fmt: skip
+        max_examples=count, deadline=None, database=None, suppress_health_check=list(HealthCheck)
+    )
 
 
 def read_or_refused(work: Callable[[], object]) -> str:

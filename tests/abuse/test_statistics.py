@@ -168,6 +168,7 @@ def test_fewer_settings_than_parameters_are_told() -> None:
     assert "about 6 parameters" in said
 
 
+@pytest.mark.slow  # as of lines in validation/test_residuals.py
 def test_heavy_tails(tmp_path: Path) -> None:
     noise = 0.03 * np.random.default_rng(4).standard_t(1.2, N)
     rows = Rows.made(noise)
@@ -180,6 +181,7 @@ def test_heavy_tails(tmp_path: Path) -> None:
     assert "tails" not in warned(student)
 
 
+@pytest.mark.slow
 def test_uneven_noise(tmp_path: Path) -> None:
     slip = Rows.made().slip
     noise = 0.01 * np.exp(5.0 * slip) * np.random.default_rng(5).standard_normal(N)

@@ -24,7 +24,6 @@ from calib.batch import folders as unfinished
 from calib.batch.folders import claimed, fresh_folder
 from calib.batch.pool import pool
 from calib.batch.user_code import call, run_file
-from calib.cli import _readable
 from calib.cli.app import app
 from calib.data.files import decoded, read_json
 from calib.data.quantities import QUANTITIES
@@ -82,30 +81,16 @@ def shell(command: str, **environment: str) -> subprocess.CompletedProcess[str]:
 # Terminals
 
 
-@pytest.mark.parametrize(
-    ("text", "plain"),
-    [
-        ("θ = 3", "theta = 3"), ("(0.1 ± 1.2)×10⁷", "(0.1 +- 1.2)x10^7"), ("10⁻⁷ m²", "10^-7 m^2"),  # noqa: RUF001
-        ("µm", "mum"), ("Prüfer – ∑", "Prufer - \\u2211"), ("中", "\\u4e2d"), ("\udcff", "\\udcff"),  # noqa: RUF001
-        ("k_φ ≤ 2 → ΔF", "k_phi <= 2 -> deltaF"),
-    ],
-)  # fmt: skip
-def test_what_an_encoding_lacks_is_written_otherwise(text: str, plain: str) -> None:
-    import codecs
-
-    codecs.register_error("calib.readable", _readable)
-    assert text.encode("ascii", "calib.readable").decode("ascii") == plain
-
-
 def test_a_limited_terminal_and_a_name_in_no_encoding_cost_nothing() -> None:
     """Files are in UTF-8 all the same."""
     name = os.fsdecode(b"r\xff.csv")
     shutil.copy("ruts.csv", name)
     done = shell(
-        f"calib report {name} --model bekker --max-steps 400 --workers 1 --out rep",
+        f"calib report {name} --model bekker --max-steps 100 --workers 1 --out rep",
         LC_ALL="C", PYTHONUTF8="0", PYTHONCOERCECLOCALE="0", PYTHONIOENCODING="ascii",
     )  # fmt: skip
-    assert (done.returncode, "Traceback" in done.stderr) == (0, False), done.stderr
+    assert done.returncode in (0, 3), done.stderr
+    assert "Traceback" not in done.stderr
     assert "?" not in done.stdout  # readable, if in other letters
     page = Path("rep/index.html").read_text(encoding="utf-8")
     assert "²" in page
@@ -134,23 +119,24 @@ def fail(*_: object, **__: object) -> Any:
 @pytest.mark.parametrize(
     ("words", "stage", "kept"),
     [
-        (FIT, "calib.validation.comparison.noise_preference", "run-unfinished/run"),
         (
-            ["report", "ruts.csv", "--model", "bekker", "--max-steps", "400", "--workers", "1",
-             "--out", "run"],
-            "calib.report.study.prior_sensitivity", "run-unfinished/rut_depth",
+            "fit ruts.csv --model bekker", "calib.validation.comparison.noise_preference",
+            "run-unfinished/run",
         ),
         (
-            ["compare", "bekker", "modified_bekker", "slip.csv", "--max-steps", "400", "--workers",
-             "1", "--out", "run"],
+            "report ruts.csv --model bekker --workers 1", "calib.report.study.prior_sensitivity",
+            "run-unfinished/rut_depth",
+        ),
+        (
+            "compare bekker modified_bekker slip.csv --workers 1",
             "calib.validation.comparison.leave_one_out", "run-unfinished/bekker",
         ),
     ],
 )  # fmt: skip
-def test_an_interruption_loses_no_posterior(words: list[str], stage: str, kept: str) -> None:
+def test_an_interruption_loses_no_posterior(words: str, stage: str, kept: str) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stage, interrupt)
-        done = run(*words)
+        done = run(*words.split(), "--max-steps", "100", "--out", "run")
     assert done.exit_code == 130, done.output
     assert not Path("run").exists()
     assert "calib: what was finished is in run-unfinished" in done.stderr
@@ -206,15 +192,6 @@ def keeps(name: str) -> str:
     return "kept"
 
 
-def test_of_what_was_written_nothing_is_kept_besides(tmp_path: Path) -> None:
-    with claimed(tmp_path / "out"):
-        unfinished.keep("part", write_here)
-        with fresh_folder(tmp_path / "out") as folder:
-            write_here(folder)
-    assert {p.name for p in tmp_path.rglob("*")} >= {"out", "word"}
-    assert not list(tmp_path.glob("*unfinished*")) + list(tmp_path.glob(".out-*"))
-
-
 @pytest.mark.parametrize("fails", [False, True])
 def test_a_result_is_written_where_it_was_claimed(fails: bool, tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
@@ -228,6 +205,7 @@ def test_a_result_is_written_where_it_was_claimed(fails: bool, tmp_path: Path) -
     assert Path.cwd() == tmp_path
     (found,) = tmp_path.rglob("word")
     assert found.relative_to(tmp_path).parts[0] == ("out-unfinished" if fails else "out")
+    assert fails or not list(tmp_path.glob("*unfinished*")) + list(tmp_path.glob(".out-*"))
 
 
 def test_where_no_place_is_left_beside_it_is_among_temporary_files(
@@ -659,7 +637,9 @@ def test_an_interruption_says_what_is_there(monkeypatch: pytest.MonkeyPatch) -> 
     calib.load_calibration(Path("run"))
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, pytest.param(signal.SIGHUP, marks=pytest.mark.slow)]
+)
 def test_of_an_interruption_another_error_may_be_made(number: int) -> None:
     """As extension modules do that are just being imported."""
     code = f"""

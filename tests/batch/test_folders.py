@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import shutil
 import subprocess
@@ -44,6 +45,16 @@ def beside_ours(place: Path) -> Path:
     return place / "thesis"
 
 
+def among_ours(place: Path) -> Path:
+    figures = place / "report" / "figures"
+    figures.mkdir(parents=True)
+    for name in ("drawn.png", "mine.png"):
+        (figures / name).write_text("x")
+    record = {"files": {"figures/drawn.png": "hash"}}
+    (place / "report" / "manifest.json").write_text(json.dumps(record))
+    return place / "report"
+
+
 def below_a_file(place: Path) -> Path:
     (place / "file").write_text("x")
     return place / "file" / "deeper" / "run"
@@ -54,6 +65,7 @@ def below_a_file(place: Path) -> Path:
     [
         (thesis, "was not written by calib"),
         (beside_ours, "holds files that calib did not write: chapter1.tex"),
+        (among_ours, "holds files that calib did not write: figures/mine.png"),
         (lambda place: below_a_file(place).parents[1], "is an existing file"),
         (below_a_file, "file is a file"),
         (lambda place: place / ("x" * 300), "cannot be written"),

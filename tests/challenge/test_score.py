@@ -107,38 +107,26 @@ def write(results: Path, key: Path, answer: Answer, skip: tuple[str, ...] = ()) 
             rows.writerows([0.1, 0.5, value] for value in after)
 
 
-def test_perfect_diagnoses_reach_every_level(sealed: tuple[Path, Path], tmp_path: Path) -> None:
-    write(tmp_path / "r", sealed[1], perfect)
-    got = score(sealed[0], tmp_path / "r", sealed[1])
-    for tier in got.tiers.values():
-        assert tier.top_1 == tier.top_2 == Proportion(4, 4)
-        assert tier.top_1_all == Proportion(6, 6)
-        assert tier.truth_probability.value == 1.0
-        assert tier.false_alarm == Proportion(0, 2)
-        assert tier.unlisted_recognised == Proportion(1, 1)
-        assert tier.listed_called_unknown == Proportion(0, 3)
-        assert tier.confidently_wrong == Proportion(0, 6)
-        assert tier.localisation_auc.value == 1.0
-        assert tier.shrink_coverage == Proportion(4, 4)
-        assert tier.actual_shrink.value == 1.0
-        assert tier.brier.value == 0.0
-        assert tier.n_failed == 0
-
-
-def test_worst_diagnoses_reach_none(sealed: tuple[Path, Path], tmp_path: Path) -> None:
-    write(tmp_path / "r", sealed[1], worst)
+@pytest.mark.parametrize("best", [True, False])
+def test_perfect_diagnoses_reach_every_level_and_the_worst_none(
+    best: bool, sealed: tuple[Path, Path], tmp_path: Path
+) -> None:
+    write(tmp_path / "r", sealed[1], perfect if best else worst)
+    right, wrong = (1, 0) if best else (0, 1)
     for tier in score(sealed[0], tmp_path / "r", sealed[1]).tiers.values():
-        assert tier.top_1 == tier.top_2 == Proportion(0, 4)
-        assert tier.truth_probability.value == 0.0
-        assert tier.false_alarm == Proportion(2, 2)
-        assert tier.unlisted_recognised == Proportion(0, 1)
-        assert tier.listed_called_unknown == Proportion(3, 3)
-        assert tier.confidently_wrong == Proportion(6, 6)
-        assert tier.localisation_auc.value == 0.0
-        assert tier.shrink_coverage == Proportion(0, 4)
-        assert tier.actual_shrink.value == pytest.approx(-1.0)
-        assert tier.brier.value == 2.0
-        assert not any(level.met(tier.tier, getattr(tier, level.name).value) for level in LEVELS)
+        assert tier.top_1 == tier.top_2 == tier.shrink_coverage == Proportion(4 * right, 4)
+        assert tier.truth_probability.value == tier.localisation_auc.value == right
+        assert tier.false_alarm == Proportion(2 * wrong, 2)
+        assert tier.unlisted_recognised == Proportion(right, 1)
+        assert tier.listed_called_unknown == Proportion(3 * wrong, 3)
+        assert tier.confidently_wrong == Proportion(6 * wrong, 6)
+        assert tier.actual_shrink.value == pytest.approx(right - wrong)
+        assert tier.brier.value == 2.0 * wrong
+        assert tier.n_failed == 0
+        if best:
+            assert tier.top_1_all == Proportion(6, 6)
+        met = [level.met(tier.tier, getattr(tier, level.name).value) for level in LEVELS]
+        assert best or not any(met)
 
 
 @pytest.mark.parametrize("broken", ["missing", "not json", "probability 3"])

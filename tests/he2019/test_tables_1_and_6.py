@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from calib.data import hold_out
 from calib.he2019.audit.bounds import printed
 from calib.he2019.audit.finding import Verdict
-from calib.he2019.audit.table1 import density_findings, density_range
 from calib.he2019.audit.table6 import (
     attenuation,
     inverse_by_likelihood,
@@ -25,6 +24,7 @@ from calib.he2019.audit.table6 import (
     study_quality,
     within_pressure_sd,
 )
+from calib.he2019.audit.tables_1_to_4 import density_findings, density_range
 from calib.he2019.embedded import load_he2019
 from calib.he2019.estimators import rut_regression
 from calib.he2019.published import PUBLISHED

@@ -8,12 +8,6 @@ from scipy.optimize import least_squares
 
 from calib.he2019.audit.bounds import ASSUMED_SLIPS, NAMES
 from calib.he2019.audit.finding import Basis, Verdict
-from calib.he2019.audit.table3 import (
-    chord_curvature,
-    features,
-    geometric_findings,
-    sign_of_curvature,
-)
 from calib.he2019.audit.table5 import (
     Bounds,
     cost_as_printed,
@@ -26,7 +20,13 @@ from calib.he2019.audit.table5 import (
     study_rounding,
     targets,
 )
-from calib.he2019.embedded import columns
+from calib.he2019.audit.tables_1_to_4 import (
+    chord_curvature,
+    features,
+    geometric_findings,
+    sign_of_curvature,
+)
+from calib.he2019.embedded import tables
 from calib.he2019.estimators import Features, coefficients
 from calib.he2019.published import PUBLISHED
 from calib.he2019.reconstruction import magic_formula_jacobian
@@ -207,7 +207,7 @@ def test_the_printed_cost_is_not_a_minimum(at_most):
         ("0.0500", Verdict.CONTRADICTED, Basis.PRINTED),
         ("0.1500", Verdict.CONTRADICTED, Basis.PRINTED),
     ],
-)  # fmt: skip
+)
 def test_another_cost_would_be_judged_otherwise(cost, verdict, basis, at_most):
     # The bounds follow from Table 4 alone.
     found = joint_cost(altered({"Table 5: cost": cost}), 0.0709, at_most)
@@ -245,7 +245,7 @@ def test_simulated_data_at_the_assumed_slips(optimal, at_most):
 
 
 def test_the_reconstructed_optimum_obeys_all_bounds(at_most):
-    pulls = columns("drawbar_pull")["drawbar_pull_kn"].reshape(3, -1)
+    pulls = tables()["drawbar_pull"]["drawbar_pull_kn"].reshape(3, -1)
     optimum = joint_optimum([ASSUMED_SLIPS] * 3, pulls)
     assert optimum == pytest.approx(0.0709, abs=5e-5)
     assert optimum < at_most.optimal < at_most.assumed < at_most.anywhere

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -15,9 +14,11 @@ import calib
 from calib.data import hold_out, table_from_arrays
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration, calibrate
+from calib.inference.diagnostics import Gate
 from calib.inference.likelihood import Noise
 from calib.inference.priors import Priors
 from calib.inference.problem import Problem
+from calib.inference.sampler import SamplerSettings
 from calib.models import MODELS
 from calib.report.comparison import document, load_stack, write_comparison
 from calib.validation import comparison
@@ -32,10 +33,11 @@ from calib.validation.comparison import (
 )
 from calib.validation.constants import N_DRAWS
 from calib.validation.prediction import predict, predict_stacked
-from calib.validation.validate import leave_one_out
+from calib.validation.validate import Validation, leave_one_out
 from tests.custom_problems import normal, problem_of
 
-SHARED = Path(__file__).parents[2] / ".." / "shared"
+# Where what is asked does not need many draws.
+FEW = SamplerSettings(steps=100, max_steps=100, gate=Gate(rhat_max=2, ess_min=0, taus_min=0))
 PLATE = ("average_ground_pressure_kpa", "plate_width_mm", "rut_depth_mm")
 
 
@@ -100,7 +102,7 @@ def test_models_that_say_the_same_are_not_told_apart() -> None:
     rows = plates(4, 0.0).columns
     # Of one width, Reece's and Bekker's equations are the same curve.
     one = table_from_arrays({**rows, "plate_width_mm": np.full(len(rows[PLATE[0]]), 100.0)})
-    found = compare(one, ["reece", "bekker_plate"], 5)
+    found = compare(one, ["reece", "bekker_plate"], 5, settings=FEW)
     assert not found.differences[found.candidates[1].model].clear
     assert "cannot tell" in found.sentence
 
@@ -138,31 +140,6 @@ def test_a_stack_is_written_and_predicts(frictional: Comparison, tmp_path: Path)
     np.testing.assert_allclose(
         stacked.predictive.lower[0.9], plain.predictive.lower[0.9], rtol=0.04
     )
-
-
-@pytest.mark.slow
-def test_measured_plates_prefer_the_law_without_width() -> None:
-    """Sand of which the smaller plates sank deeper: neither width term can follow."""
-    path = SHARED / "data" / "cmu_plate_sinkage.csv"
-    if not path.exists():
-        pytest.skip("the measured plate data are not here")
-    with path.open() as file:
-        measured = [r for r in csv.DictReader(file)
-                    if r["element"] == "plate" and r["container"] == "large"]  # fmt: skip
-    rows = []
-    # Readings along a run depend on each other: four of each, spread over it.
-    for run in sorted({r["run_id"] for r in measured}):
-        own = [r for r in measured if r["run_id"] == run and float(r["pressure_kPa"]) > 1.0]
-        rows += [own[i] for i in np.linspace(0, len(own) - 1, 4).round().astype(int)]
-    keys = ("pressure_kPa", "plate_diameter_m", "sinkage_corrected_m")
-    columns = [np.array([float(r[k]) for r in rows]) for k in keys]
-    table = table_from_arrays(
-        dict(zip(PLATE, (columns[0], 1e3 * columns[1], 1e3 * columns[2]), strict=True))
-    )
-    found = compare(table, ["bekker", "bekker_plate", "reece"], 7)
-    assert found.sound
-    assert found.candidates[0].model == "bekker"
-    assert found.differences["reece"].clear
 
 
 def test_no_shipped_model_is_chosen_for_the_papers_tables_but_its_own() -> None:
@@ -209,42 +186,53 @@ def noisy_line(noise: np.ndarray) -> Problem:
 
 
 def calibrated(noise: np.ndarray) -> Calibration:
-    return calibrate(noisy_line(noise), 3)
+    return calibrate(noisy_line(noise), 3, settings=FEW)
+
+
+def preference(calibration: Calibration, loo: Validation | None = None) -> NoisePreference:
+    found = noise_preference(calibration, loo=loo, settings=FEW)
+    assert found is not None
+    return found
 
 
 def test_the_noise_that_made_the_rows_is_preferred() -> None:
     rng = np.random.default_rng(3)
     z = (SLIP - SLIP.mean()) / SLIP.std()
-    found = noise_preference(calibrated(0.1 * np.exp(z) * rng.standard_t(2.0, 40)))
-    assert found is not None
+    found = preference(calibrated(0.1 * np.exp(z) * rng.standard_t(2.0, 40)))
     assert found.preferred == "chosen"
     assert found.sentence.startswith("The data prefer Student-t noise that depends on slip to nor")
     assert f"{found.elpd:+.1f}" in found.sentence
 
 
-def test_normal_rows_need_no_other_noise() -> None:
-    calibration = calibrated(0.1 * np.random.default_rng(4).standard_normal(40))
-    own = leave_one_out(calibration)
-    found = noise_preference(calibration, loo=own)
-    assert found is not None
+@pytest.fixture(scope="module")
+def steady() -> Calibration:
+    return calibrated(0.1 * np.random.default_rng(4).standard_normal(40))
+
+
+def test_normal_rows_need_no_other_noise(steady: Calibration) -> None:
+    own = leave_one_out(steady, settings=FEW)
+    found = preference(steady, own)
     assert found.preferred == "neither"
     assert abs(found.elpd) < 4.0
     # The difference is that of the two sums of leave-one-out.
-    problem = with_usual_noise(calibration.problem)
+    problem = with_usual_noise(steady.problem)
     assert problem.names == ("a", "b", "sigma")
-    usual = calibrate(problem, 3, label=" normal noise")
-    expected = own.elpd - leave_one_out(usual).elpd
+    usual = calibrate(problem, 3, label=" normal noise", settings=FEW)
+    expected = own.elpd - leave_one_out(usual, settings=FEW).elpd
     assert found.elpd == pytest.approx(expected, abs=0.1)
     # What has normal noise already is not compared.
     assert noise_preference(usual) is None
 
 
-def test_one_row_that_decides_is_named() -> None:
-    noise = 0.1 * np.random.default_rng(5).standard_normal(40)
-    noise[20] = 20.0
-    found = noise_preference(calibrated(noise))
-    assert found is not None
-    assert found.line == noisy_line(noise).table.lines[20]
+def test_one_row_that_decides_is_named(
+    steady: Calibration, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = leave_one_out(steady, settings=FEW, refit=False)
+    rows = np.array(own.elpd_rows)
+    rows[20] -= 30.0
+    monkeypatch.setattr(comparison, "leave_one_out", lambda *_, **__: replace(own, elpd_rows=rows))
+    found = preference(steady, own)
+    assert found.line == steady.problem.table.lines[20]
     assert f"More than half of that is line {found.line}" in found.sentence
 
 

@@ -119,15 +119,6 @@ def test_predictive_bands_add_the_noise(pull_calibration: Calibration) -> None:
         assert np.all(found.predictive.lower[level] < found.parameter.lower[level])
 
 
-def test_ruts_are_predicted_in_millimetres(rut_calibration: Calibration) -> None:
-    table = table_from_arrays(
-        {"average_ground_pressure_kpa": np.array([140.0]), "slip_ratio": np.array([0.1])}
-    )
-    found = predict(rut_calibration, table)
-    assert 10.0 < found.predictive.lower[0.95][0] < found.parameter.median[0] < 60.0
-    assert found.parameter.median[0] < found.predictive.upper[0.95][0] < 100.0
-
-
 def test_draws_come_in_the_order_of_mean_and_measurement(rut_calibration: Calibration) -> None:
     at = rut_calibration.problem.conditions
     mean, measured = predictive_draws(rut_calibration, at, np.random.default_rng(1), size=1000)

@@ -25,6 +25,7 @@ from calib.validation.residuals import (
     outlying_rows,
     residual_checks,
 )
+from calib.validation.scores import holm
 from tests.custom_problems import normal, problem_of
 from tests.validation.lines import fitted_line, line_problem, notes, said, with_columns
 
@@ -66,6 +67,7 @@ def test_holms_procedure_is_that_of_its_table() -> None:
     tests = [Check(p, Remark(str(p))) for p in (0.01, 0.04, 0.03, 0.005)]
     # 0.005 < 0.05/4 and 0.01 < 0.05/3, but 0.03 is not below 0.05/2, so 0.04 stays as well.
     assert [remark.text for remark in failed(tests, 0.05)] == ["0.01", "0.005"]
+    assert holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
     assert failed([Check(float("nan"), Remark("x"))]) == ()
 
 

@@ -8,6 +8,7 @@ from scipy import stats
 
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.io import to_datatree
+from calib.inference.sampler import SamplerSettings
 from calib.validation.constants import CONTRACTION_MIN, LEVELS, SENSITIVITY_MIN
 from calib.validation.scores import (
     Sensitivity,
@@ -42,23 +43,15 @@ def test_crps_of_a_normal(y: float) -> None:
     assert crps(draws, np.array([y]))[0] == pytest.approx(expected, abs=1e-3)
 
 
-@pytest.mark.parametrize(("hits", "n"), [(9, 14), (1, 30), (29, 30), (50, 100)])
-def test_coverage_has_the_jeffreys_interval(hits: int, n: int) -> None:
+@pytest.mark.parametrize(("hits", "n"), [(9, 14), (1, 30), (50, 100), (0, 5), (5, 5)])
+def test_coverage_has_the_jeffreys_interval_closed_at_none_and_all(hits: int, n: int) -> None:
     draws = np.tile(np.linspace(-1.0, 1.0, 201)[:, None], n)
     observed = np.where(np.arange(n) < hits, 0.0, 5.0)
     found = coverage(draws, observed, 0.9)
     assert (found.hits, found.n, found.proportion) == (hits, n, hits / n)
-    expected = stats.beta.interval(0.95, hits + 0.5, n - hits + 0.5)
+    low, high = stats.beta.interval(0.95, hits + 0.5, n - hits + 0.5)
+    expected = [low if hits else 0.0, high if hits < n else 1.0]
     np.testing.assert_allclose([found.lower, found.upper], expected, rtol=1e-10)
-
-
-def test_the_interval_of_none_and_all_reaches_the_end() -> None:
-    draws = np.linspace(-1.0, 1.0, 201)[:, None] * np.ones(5)
-    none, every = (coverage(draws, np.full(5, y), 0.5) for y in (9.0, 0.0))
-    assert (none.lower, none.hits) == (0.0, 0)
-    assert (every.upper, every.hits) == (1.0, 5)
-    assert none.upper == pytest.approx(stats.beta.ppf(0.975, 0.5, 5.5))
-    assert every.lower == pytest.approx(stats.beta.ppf(0.025, 5.5, 0.5))
 
 
 @pytest.mark.parametrize("level", LEVELS)
@@ -81,19 +74,16 @@ def simulated(spread: float) -> tuple[np.ndarray, np.ndarray]:
     return mean + sd * rng.standard_normal((2000, 400)), mean + spread * sd * rng.normal(size=400)
 
 
-def test_calibrated_predictions_have_a_uniform_pit_and_the_coverage_they_claim() -> None:
-    found = score(*simulated(1.0))
-    # One fixed seed; a calibrated method fails either line with probability 1e-3 or less.
-    assert stats.kstest(found.pit, "uniform").pvalue > 1e-3
-    for level, c in found.coverage.items():
-        assert stats.binomtest(c.hits, c.n, level).pvalue > 1e-3
-
-
-@pytest.mark.parametrize("spread", [0.5, 2.0])
-def test_miscalibrated_predictions_are_noticed(spread: float) -> None:
+@pytest.mark.parametrize("spread", [0.5, 1.0, 2.0])
+def test_miscalibrated_predictions_are_noticed_and_others_are_not(spread: float) -> None:
+    """A calibrated method fails either line with probability 1e-3 or less, at one fixed seed."""
     found = score(*simulated(spread))
-    assert stats.kstest(found.pit, "uniform").pvalue < 1e-3
-    assert stats.binomtest(found.coverage[0.5].hits, 400, 0.5).pvalue < 1e-3
+    p = stats.kstest(found.pit, "uniform").pvalue
+    covered = {v: stats.binomtest(c.hits, c.n, v).pvalue for v, c in found.coverage.items()}
+    if spread == 1.0:
+        assert min(p, *covered.values()) > 1e-3
+    else:
+        assert max(p, covered[0.5]) < 1e-3
 
 
 def test_relative_errors_leave_out_what_is_near_zero() -> None:
@@ -123,6 +113,7 @@ def test_sorted_normals_lie_where_they_are_expected() -> None:
 
 SLIP = np.linspace(0.0, 0.3, 10)
 SIGMA = 0.5
+FEW = SamplerSettings(steps=200, max_steps=200)
 
 
 def pulls(mean: float = 1.0) -> np.ndarray:
@@ -186,7 +177,7 @@ def test_a_normal_posterior_reacts_as_in_closed_form(prior: tuple[float, float])
 def test_a_parameter_without_effect_is_not_identified() -> None:
     priors = (normal("a", 0.0, 3.0), normal("idle", 2.0, 1.0), fixed("sigma", SIGMA))
     problem = problem_of(lambda a, idle, x: a + 0.0 * idle * x, priors, SLIP, pulls())
-    found = prior_sensitivity(calibrate(problem, 1))
+    found = prior_sensitivity(calibrate(problem, 1, settings=FEW))
     assert found["a"].identified
     assert found["a"].reading == "data"
     assert not found["idle"].identified
@@ -198,7 +189,7 @@ def test_two_parameters_of_which_only_the_sum_is_seen() -> None:
     """Each contracts to half its prior variance, yet only the prior tells them apart."""
     priors = (normal("a", 0.0, 1.0), normal("b", 0.0, 1.0), fixed("sigma", SIGMA))
     problem = problem_of(lambda a, b, x: a + b + 0.0 * x, priors, SLIP, pulls())
-    found = prior_sensitivity(calibrate(problem, 1))
+    found = prior_sensitivity(calibrate(problem, 1, settings=FEW))
     for name in "ab":
         assert found[name].contraction == pytest.approx(0.5, abs=0.05)
         assert found[name].contraction > CONTRACTION_MIN

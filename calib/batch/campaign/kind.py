@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from calib.batch.folders import read_folder
 from calib.errors import CalibError
 from calib.inference.emulation import Emulation
-from calib.models import MODELS, Model
+from calib.models import Model
 from calib.models.simulators.declaration import simulated_by
 from calib.report.numbers import finite
 
@@ -37,20 +37,9 @@ class Section(BaseModel):
 
 @dataclass(frozen=True)
 class Task:
-    """A task of a plan.
+    """A task of a plan: its name, kind and seed, the files it reads by the names to show.
 
-    Parameters
-    ----------
-    name : str
-        Of its table and of what tells it from the others of that table.
-    kind : str
-        One of `calib.batch.campaign.kinds.KINDS`.
-    seed : int
-        From the stream of the task's name.
-    settings : mapping of str to object
-        All else that decides the result beside the inputs; JSON can hold it.
-    inputs : mapping of str to Path
-        Files that are read, by the names to show.
+    Settings are all else that decides the result; JSON can hold them.
     """
 
     name: str
@@ -70,19 +59,10 @@ type Work = tuple[dict[str, Any], Mapping[str, str | bytes]]
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of task.
+    """A kind of task: the schema of its tables in a plan, and what is done with one.
 
-    Parameters
-    ----------
-    section : type
-        Schema of its tables in a plan.
-    plan : callable
-        ``(section, place) -> tasks`` of a table; `place` finds files beside the plan.
-    load : callable
-        ``task -> item``, where the campaign was started; the item is pickled and sent to where the
-        work is done.
-    work : callable
-        ``(item, seed) -> (numbers, files)``, in any process on any machine.
+    `plan` yields the tasks of a table. `load` makes, where the campaign was started, the item that
+    is pickled and sent to `work`, which is called with it and the seed on any machine.
     """
 
     section: type[Section]
@@ -195,22 +175,6 @@ def simulators_of(models: Iterable[str]) -> dict[str, Any]:
     """Return what the results of a task depend on of simulators of the user's own."""
     found = {m: s.simulator.digest for m in models if (s := simulated_by(m)) is not None}
     return {"simulators": found} if found else {}
-
-
-@contextmanager
-def in_place(made: Sequence[Emulated]) -> Iterator[None]:
-    """Let models be their emulators, in this process and for this task."""
-    before = [MODELS[e.model.name] for e in made if e.model.name in MODELS]
-    try:
-        for e in made:
-            MODELS.discard(e.model.name)
-            MODELS.add(e.model)
-        yield
-    finally:
-        for e in made:
-            MODELS.discard(e.model.name)
-        for model in before:
-            MODELS.add(model)
 
 
 def files_of(write: Callable[[Path], object]) -> dict[str, bytes]:

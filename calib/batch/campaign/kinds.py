@@ -30,7 +30,6 @@ from calib.batch.campaign.kind import (
     Work,
     emulation_file,
     files_of,
-    in_place,
     simulators_of,
     word,
 )
@@ -44,7 +43,7 @@ from calib.gap.describe import gap_document
 from calib.gap.diagnose import Diagnosis, diagnose
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.effects.user import load_effects
-from calib.inference.calibration import Calibration, calibrate
+from calib.inference.calibration import calibrate
 from calib.inference.emulation.prepared import emulated, emulated_for_both
 from calib.inference.estimators import estimate
 from calib.inference.io import save_calibration
@@ -52,12 +51,12 @@ from calib.inference.prior_files import default_priors, prior_file_model
 from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
 from calib.inference.sampler import SamplerSettings
-from calib.models import get_model
+from calib.models import MODELS, get_model
 from calib.models.simulators.declaration import slow_simulator
 from calib.models.simulators.emulator import emulator_of, save_emulator
 from calib.report.page.diagnosis import write_page
 from calib.report.study import HoldOut, read_and_split
-from calib.report.verdict import Verdict, keep_verdict, verdict
+from calib.report.verdict import keep_verdict, verdict
 from calib.validation.replicate import Item, replicate
 from calib.validation.sbc import SETTINGS, chosen_models
 from calib.validation.validate import validate_held_out
@@ -190,8 +189,12 @@ def _fit(item: FitItem, seed: int) -> Work:
     if posterior:
         # How long it took stands elsewhere: without it, equal posteriors are equal files.
         timeless = replace(calibration, draws=replace(calibration.draws, seconds=0.0))
-        run = files_of(lambda folder: _keep_run(timeless, judged, folder))
-        files |= {f"run/{name}": data for name, data in run.items()}
+
+        def keep(folder: Path) -> None:
+            save_calibration(timeless, folder)
+            keep_verdict(judged, folder)
+
+        files |= {f"run/{name}": data for name, data in files_of(keep).items()}
     if emulation is not None:
         numbers["converged"] = report.passed and emulation.numbers["passed"]
         numbers["emulator"] = emulation.numbers
@@ -209,11 +212,6 @@ def _fit(item: FitItem, seed: int) -> Work:
             "in_90_percent_band": scores.coverage[0.9].hits,
         }
     return numbers, files
-
-
-def _keep_run(calibration: Calibration, judged: Verdict, folder: Path) -> None:
-    save_calibration(calibration, folder)
-    keep_verdict(judged, folder)
 
 
 # Diagnoses
@@ -283,7 +281,7 @@ def _load_diagnosis(task: Task) -> DiagnosisItem:
 def _diagnose(item: DiagnosisItem, seed: int) -> Work:
     """Diagnose a case, as `calib diagnose` does."""
     case, effects, page, made = item
-    with _effects(effects) as own, in_place(made):
+    with _effects(effects) as own, MODELS.standing_in(*(e.model for e in made)):
         found = diagnose(case, seed, effects={**EFFECTS, **own})
         files: dict[str, str | bytes] = {**written(found, effects)}
         if page:

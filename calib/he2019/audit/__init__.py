@@ -24,12 +24,11 @@ from calib.he2019.audit.searches import (
     study_convergence,
     study_curvature_signs,
 )
-from calib.he2019.audit.table1 import density_findings
-from calib.he2019.audit.table3 import geometric_findings, sign_of_curvature
 from calib.he2019.audit.table5 import (
     RoundingStudy,
+    cost_as_printed,
     cost_bounds,
-    cost_findings,
+    joint_cost,
     pressure_unit,
     rounding_findings,
     signs_of_quadratic,
@@ -38,11 +37,18 @@ from calib.he2019.audit.table5 import (
 from calib.he2019.audit.table6 import (
     InverseStudy,
     QualityStudy,
-    inverse_findings,
+    inverse_by_likelihood,
+    inverse_by_print,
+    prediction_at_30,
     rut_quality_findings,
     signs_of_rut,
     study_inverse,
     study_quality,
+)
+from calib.he2019.audit.tables_1_to_4 import (
+    density_findings,
+    geometric_findings,
+    sign_of_curvature,
 )
 from calib.he2019.published import DOI, PUBLISHED, Published
 from calib.inference.calibration import Calibration
@@ -124,11 +130,14 @@ def run_audit(
         signs_of_rut(published),
         *curvature_signs(published, curvature),
         pressure_unit(published),
-        *cost_findings(published, genetic.joint.optimum, bounds_asked.result()),
+        joint_cost(published, genetic.joint.optimum, bounds_asked.result()),
+        cost_as_printed(published),
         *rounding_findings(published, rounding),
         *convergence_findings(genetic),
         *rut_quality_findings(published, quality),
-        *inverse_findings(published, inverse),
+        inverse_by_print(published),
+        inverse_by_likelihood(published, inverse),
+        prediction_at_30(published, inverse),
         finding("test_description", Verdict.UNTESTABLE, setup=published.setup),
     ]
     tell("testing printed figures", 1, 1)

@@ -118,32 +118,23 @@ def printed(figure: Figure) -> Interval:
     return _outward(figure.value - figure.half_unit, figure.value + figure.half_unit)
 
 
-def _increasing(function: Callable[[Array], Array], x: Interval) -> Interval:
-    return _outward(function(x.lower), function(x.upper))
+def _increasing(
+    function: Callable[[Array], Array], above: float | None = None, below: float | None = None
+) -> Callable[[Interval], Interval]:
+    """Return an increasing function of intervals that lie inside its domain."""
+
+    def of(x: Interval) -> Interval:
+        if (above is not None and np.any(x.lower <= above)) or (
+            below is not None and np.any(x.upper >= below)
+        ):
+            raise ValueError(f"the interval leaves {above} to {below}, where this is taken")
+        return _outward(function(x.lower), function(x.upper))
+
+    return of
 
 
-def arctan(x: Interval) -> Interval:
-    """Arc tangent."""
-    return _increasing(np.arctan, x)
-
-
-def exp(x: Interval) -> Interval:
-    """Exponential."""
-    return _increasing(np.exp, x)
-
-
-def log(x: Interval) -> Interval:
-    """Natural logarithm of positive intervals."""
-    if np.any(x.lower <= 0.0):
-        raise ValueError("an interval that is not positive has no logarithm")
-    return _increasing(np.log, x)
-
-
-def tan(x: Interval) -> Interval:
-    """Tangent on 0 to pi/2, both excluded."""
-    if np.any((x.lower <= 0.0) | (x.upper >= 0.5 * np.pi)):
-        raise ValueError("the tangent is taken between 0 and pi/2")
-    return _increasing(np.tan, x)
+arctan, exp, log = _increasing(np.arctan), _increasing(np.exp), _increasing(np.log, 0.0)
+tan = _increasing(np.tan, 0.0, 0.5 * np.pi)
 
 
 def square(x: Interval) -> Interval:
@@ -255,11 +246,6 @@ def _largest_argument(E: float) -> float:
     return float(-np.sqrt(E - 1.0) + E * np.arctan(1.0 / np.sqrt(E - 1.0)))
 
 
-def peak_argument(C: Interval) -> Interval:
-    """Return tan(pi/(2C)), the argument at which the sine reaches one."""
-    return tan(exact(0.5 * np.pi) / C)
-
-
 def largest_pull(box: Coefficients) -> Interval:
     """Return the largest pull (kN) over all slips, however large.
 
@@ -275,7 +261,7 @@ def largest_pull(box: Coefficients) -> Interval:
 
 def peak_slip(box: Coefficients) -> Interval | None:
     """Return the slip (%) of the peak; None without one, ValueError if only a part has one."""
-    target = peak_argument(box.C)
+    target = tan(exact(0.5 * np.pi) / box.C)  # where the sine reaches one
     low_E, high_E = float(box.E.lower), float(box.E.upper)
     if high_E > 1.0:
         if low_E > 1.0 and _largest_argument(low_E) * (1.0 + 1e-12) < float(target.lower):

@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, Self
+from typing import Any
 
 from calib.data.files import plain_number
 from calib.he2019 import declared
@@ -25,44 +25,31 @@ def percent(fraction: float, digits: int = 3) -> str:
     return f"{format_number(100.0 * fraction, digits)} %"
 
 
-class _Explained(StrEnum):
-    """A word, and one sentence on what it means."""
-
-    meaning: str
-
-    def __new__(cls, value: str, meaning: str = "") -> Self:
-        """Make a word that may have a meaning."""
-        self = str.__new__(cls, value)
-        self._value_, self.meaning = value, meaning
-        return self
+class _Word(StrEnum):
+    @property
+    def meaning(self) -> str:
+        """One sentence on what it means, if it needs one."""
+        meanings: dict[str, str] = _CLAIMS["meanings"]
+        return meanings.get(self.value, "")
 
 
-class Verdict(_Explained):
+class Verdict(_Word):
     """What a test says of a published figure."""
 
-    CONTRADICTED = "contradicted", "cannot hold together with what else is printed"
-    CORRECTED = (
-        "corrected", "does not say what it is taken to say; what should stand there is given"
-    )  # fmt: skip
-    CONFIRMED = "confirmed", "the figure as read passes a test that its rivals fail"
-    CONSISTENT = "consistent", "passes a test it could have failed, which does not prove it"
-    UNTESTABLE = "cannot be tested", "nothing printed decides; measured data would"
+    CONTRADICTED = "contradicted"
+    CORRECTED = "corrected"
+    CONFIRMED = "confirmed"
+    CONSISTENT = "consistent"
+    UNTESTABLE = "cannot be tested"
 
 
-class Basis(_Explained):
+class Basis(_Word):
     """What a verdict rests on; its meaning is what a reader must not conclude from it."""
 
     PRINTED = "printed figures alone"
-    SLIPS = (
-        "printed figures and the assumed slips",
-        "The slips are assumed where the source does not print them.",
-    )
+    SLIPS = "printed figures and the assumed slips"
     PHYSICS = "printed figures and physical limits"
-    RECONSTRUCTED = (
-        "reconstructed data",
-        "The data were reconstructed so that Tables 1, 4 and 6 are their exact optimum: this shows "
-        "what the method does with such data and proves nothing about the measured ones.",
-    )
+    RECONSTRUCTED = "reconstructed data"
 
 
 @dataclass(frozen=True)

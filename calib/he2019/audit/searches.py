@@ -105,29 +105,26 @@ def study_convergence(
     n = seeds.printed_coordinates
     halves = [range(n // 2), range(n // 2, n)] if n > 1 else [range(n)]
     printed = [pool.submit(_in_printed_coordinates, box, seed, runs, settings) for runs in halves]
-    joint_text = published.pressure.quality["cost"].text
-    joint = pool.submit(_repeat, None, joint_text, seed, seeds.joint, settings)
-    by_pressure = {
-        psi: pool.submit(_repeat, psi, table.quality["cost"].text, seed, seeds.by_pressure,
-                         settings)
-        for psi, table in published.genetic.items()
-    }  # fmt: skip
-    planned = seeds.by_pressure * len(by_pressure) + seeds.joint + n
-    what, alone = "genetic algorithm over seeds", {}
-    for i, (psi, asked) in enumerate(by_pressure.items(), start=1):
-        alone[psi] = asked.result()
-        tell(what, i * seeds.by_pressure, planned)
-    together = joint.result()
-    tell(what, planned - n, planned)
-    costs = np.concatenate([asked.result() for asked in printed])
+    texts = {psi: t.quality["cost"].text for psi, t in published.genetic.items()}
+    joint = published.pressure.quality["cost"].text
+    asked = [pool.submit(_repeat, *of, seed, seeds.by_pressure, settings) for of in texts.items()]
+    asked.append(pool.submit(_repeat, None, joint, seed, seeds.joint, settings))
+    planned = seeds.by_pressure * len(texts) + seeds.joint + n
+    what, found, done = "genetic algorithm over seeds", list[Search](), 0
+    for piece in asked:
+        found.append(piece.result())
+        done += found[-1].costs.size
+        tell(what, done, planned)
+    costs = np.concatenate([piece.result() for piece in printed])
     tell(what, planned, planned)
     table = load_he2019("drawbar_pull")
     read_off = {
         psi: estimate(_alone(table, psi), "geometric", generator(seed, "audit", "geometric"))
-        for psi in published.genetic
+        for psi in texts
     }
-    in_printed = Search("all pressures, c1 to b0", together.optimum, costs, joint_text)
-    return GeneticStudy(alone, together, in_printed, read_off)
+    *alone, together = found
+    in_printed = Search("all pressures, c1 to b0", together.optimum, costs, joint)
+    return GeneticStudy(dict(zip(texts, alone, strict=True)), together, in_printed, read_off)
 
 
 def _alone(table: Table, psi: int) -> Problem:

@@ -61,8 +61,6 @@ from calib.report.reference import FittedTable
 type Signs = tuple[int, int, int]
 
 READINGS: tuple[Signs, ...] = tuple((a, b, c) for a, b, c in product((1, -1), repeat=3))
-# A reading is refused if even its best coefficients miss Table 4 by more than this part.
-_FAR = 0.5
 
 
 def targets(published: Published, what: str) -> tuple[Array, Array]:
@@ -114,6 +112,11 @@ def deviations(published: Published, what: str, *, psi_per_unit: float = 1.0) ->
     return {s: nearest(published, what, signs=s, psi_per_unit=psi_per_unit)[0] for s in READINGS}
 
 
+def _far(deviation: float) -> bool:
+    """Whether a reading is refused: even its best coefficients miss Table 4 by half."""
+    return deviation > 0.5
+
+
 def signs_of_quadratic(published: Published, what: str) -> Finding:
     """Test the signs of the coefficients of D or of BCD in Table 5."""
     least, read = deviations(published, what), printed_signs(published, what)
@@ -121,7 +124,7 @@ def signs_of_quadratic(published: Published, what: str) -> Finding:
     rival_signs, rival = min(least.items(), key=lambda item: item[1])
     names, written = NAMES[what], signs_text(read)
     return finding(
-        f"table5_signs_of_{what}", beside_rival(own <= _FAR, rival <= _FAR),
+        f"table5_signs_of_{what}", beside_rival(not _far(own), not _far(rival)),
         (Quantity(f"least deviation with {written}", 100.0 * own, "%"),
          Quantity(f"least with any other, {signs_text(rival_signs)}", 100.0 * rival, "%")),
         claim="table5_signs", figures=[f"Table 5: {' '.join(names)}"], names=names, what=what,
@@ -139,7 +142,7 @@ def pressure_unit(published: Published) -> Finding:
         )
         for unit, scale in psi_per_unit.items()
     }
-    possible = {unit for unit, deviation in least.items() if deviation <= _FAR}
+    possible = {unit for unit, deviation in least.items() if not _far(deviation)}
     return finding(
         "table5_pressure_unit", beside_rival(declared in possible, bool(possible - {declared})),
         (Quantity(f"least deviation in {unit}", 100.0 * d, "%") for unit, d in least.items()),
@@ -148,9 +151,6 @@ def pressure_unit(published: Published) -> Finding:
 
 
 # The cost of Table 5
-
-# Slips up to this one (%), in bins of 1 %.
-_LARGEST_SLIP = 75
 
 
 class Bounds(NamedTuple):
@@ -180,14 +180,14 @@ def _start(table: FittedTable, C: float, slips: Array) -> Array:
 
 def _worst_norm(apart: Array, levels: int) -> Array:
     """Return the largest |d| of any slips of which no two are within 1 %: one in each bin."""
-    in_bins = apart[:-1].reshape(_LARGEST_SLIP, -1)
+    in_bins = apart[:-1].reshape(75, -1)
     largest = np.maximum(in_bins.max(axis=1), np.append(in_bins[1:, 0], apart[-1]))
     return np.asarray(np.sqrt(np.sum(np.sort(largest)[-levels:] ** 2)))
 
 
 def _largest_norm(table: FittedTable, C: float, levels: int) -> float:
     """Return a |d| (kN) that some curve with another C exceeds at no slips, rounding included."""
-    coarse, fine = (np.linspace(0.0, _LARGEST_SLIP, n * _LARGEST_SLIP + 1) for n in (4, 100))
+    coarse, fine = (np.linspace(0.0, 75.0, n * 75 + 1) for n in (4, 100))  # %
     fitted = magic_formula(coarse, **table.values)
 
     def norm(t: Array) -> float:
@@ -243,11 +243,6 @@ def cost_bounds(published: Published) -> Bounds:
     return Bounds(any_slips_bound(published), assumed, optimal)
 
 
-def cost_findings(published: Published, reconstructed: float, at_most: Bounds) -> list[Finding]:
-    """Judge the printed cost: as a minimum, beside the reconstructed one, and of the digits."""
-    return [joint_cost(published, reconstructed, at_most), cost_as_printed(published)]
-
-
 def joint_cost(published: Published, reconstructed_optimum: float, at_most: Bounds) -> Finding:
     """Judge whether the printed cost can be a minimum of Eq 16, beside the reconstructed one."""
     figure = published.pressure.quality["cost"]
@@ -268,7 +263,7 @@ def joint_cost(published: Published, reconstructed_optimum: float, at_most: Boun
         (*(between(what, floor, most, "kN^2", kind, figure.text) for what, most, kind in each),
          Quantity(name, reconstructed_optimum, "kN^2", published=figure.text)),
         basis=Basis.PRINTED if below or above else None, printed=figure, floor=floor, below=below,
-        above=above, levels=published.setup.slip_levels.text, largest_slip=_LARGEST_SLIP,
+        above=above, levels=published.setup.slip_levels.text, largest_slip=75,
         anywhere=at_most.anywhere, assumed=at_most.assumed,
     )  # fmt: skip
 
@@ -337,10 +332,11 @@ def rounding_findings(published: Published, study: RoundingStudy) -> list[Findin
     widest = {psi: float(allowed.half_width.max()) for psi, allowed in study.table4.items()}
     worst = max(widest.values())
     table4 = finding(
-        "table4_digits", Verdict.CONFIRMED if worst < 0.005 else Verdict.CORRECTED,
+        "table4_digits",
+        Verdict.CONFIRMED if worst < 0.005 else Verdict.CORRECTED,
         (Quantity(f"half the widest range at {p} psi", w, "kN") for p, w in widest.items()),
         worst=worst,
-    )  # fmt: skip
+    )
     return [
         _digits_of_D(published), _digits_of_BCD_and_E(published), _digits_of_pull(published, study),
         _digits_of_C(published), table4,

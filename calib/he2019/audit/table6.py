@@ -224,8 +224,6 @@ def _ground_pressure(published: Published) -> Finding:
 
 # What Eq 22 does to n0, n1 and k
 
-_UNITS = {"n0": "1", "n1": "1", "k": "kPa/m^n"}
-
 
 @dataclass(frozen=True, eq=False)
 class InverseStudy:
@@ -297,14 +295,6 @@ def attenuation(published: Published) -> Interval:
     return exact(1.0) / printed(published.rut_depth.quality["r_squared"])
 
 
-def inverse_findings(published: Published, study: InverseStudy) -> list[Finding]:
-    """Judge n0, n1 and k, by the printed figures and by the likelihood, and 30 psi."""
-    return [
-        inverse_by_print(published), inverse_by_likelihood(published, study),
-        prediction_at_30(published, study),
-    ]  # fmt: skip
-
-
 def _worth_correcting(published: Published) -> bool:
     # An exponent off by less would not be worth a correction.
     return float(attenuation(published).middle) - 1.0 > 0.05
@@ -327,7 +317,7 @@ def inverse_by_print(published: Published) -> Finding:
     return finding(
         "table6_inverse_regression",
         Verdict.CORRECTED if _worth_correcting(published) else Verdict.CONFIRMED,
-        (*(rounded(f"{name}, by the means of the ruts", value, _UNITS[name], figures[name])
+        (*(rounded(f"{name}, by the means of the ruts", value, figures[name].unit, figures[name])
            for name, value in corrected.items()),
          rounded("rut at 42 psi over rut at 18 psi, by their means", by_means),
          rounded("the same by Table 6", by_table)),
@@ -342,15 +332,18 @@ def inverse_by_likelihood(published: Published, study: InverseStudy) -> Finding:
     figures, quality = published.rut_depth.estimates, published.rut_depth.quality
     summary, direct = study.calibration.summary, study.direct.reported
     found = []
-    for name, unit in _UNITS.items():
+    names = ("n0", "n1", "k")
+    for name in names:
         s, kind = summary[name], "median" if name == "k" else "mean"
         found.append(
-            Quantity(f"{name}, posterior {kind}", getattr(s, kind), unit, s.hdi_lower, s.hdi_upper,
-                     "95 % HDI", figures[name].text)
+            Quantity(f"{name}, posterior {kind}", getattr(s, kind), figures[name].unit,
+                     s.hdi_lower, s.hdi_upper, "95 % HDI", figures[name].text)
         )  # fmt: skip
     found += [
-        Quantity(f"{n}, least squares of ln zt", direct[n], u, published=figures[n].text)
-        for n, u in _UNITS.items()
+        Quantity(
+            f"{n}, least squares of ln zt", direct[n], figures[n].unit, published=figures[n].text
+        )
+        for n in names
     ]
     low, middle, high = np.quantile(study.simulated, [0.025, 0.5, 0.975], axis=0).tolist()
     beside = {"n0": figures["n0"], "n1": figures["n1"], "R^2": quality["r_squared"]}

@@ -13,7 +13,7 @@ from calib.inference.diagnostics import judge
 from calib.models import example_csv
 from tests.gap.cases import PULL_ONLY, make_case, write_case
 
-N_CASES = 4
+N_CASES = 2
 PLAN = """
 seed = 7
 
@@ -71,11 +71,11 @@ source = "test"
 """
 
 
-def make_site(folder: Path, plan: str = PLAN) -> Path:
+def make_site(folder: Path, plan: str = PLAN, n_cases: int = N_CASES) -> Path:
     """Write data, cases and a plan; return the plan's path."""
     (folder / "data").mkdir(parents=True)
     (folder / "data" / "rut.csv").write_text(example_csv("bekker"))
-    for i in range(N_CASES):
+    for i in range(n_cases):
         effect = ("force_offset", None)[i % 2]
         case = make_case(effect, models=PULL_ONLY, n_lab=15, n_field=12, n_fresh=4, seed=i)
         write_case(case, folder / "cases" / f"case-{i}")

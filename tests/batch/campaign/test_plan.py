@@ -37,8 +37,8 @@ def planned(folder: Path, text: str) -> list[str]:
 def test_a_plan_is_its_tasks_by_name(site):
     plan = read_plan(site)
     assert tuple(plan.tasks) == NAMES
-    task = plan.tasks["sites.cases-case-3"]
-    assert (task.name, task.kind) == ("sites.cases-case-3", "diagnose")
+    task = plan.tasks["sites.cases-case-1"]
+    assert (task.name, task.kind) == ("sites.cases-case-1", "diagnose")
     assert sorted(task.inputs) == ["calibration", "case.toml", "field", "predict"]
     assert len({t.seed for t in plan.tasks.values()}) == len(NAMES)
 
