@@ -147,21 +147,6 @@ def fewest() -> list[dict]:
 
 
 @pytest.mark.slow
-def test_two_processes_give_what_one_gives(tmp_path: Path) -> None:
-    for workers in (1, 2):
-        run_sbc(
-            tmp_path / str(workers), models=[CHEAP], simulations=4, seed=2, settings=QUICK,
-            workers=workers,
-        )  # fmt: skip
-    one, two = (
-        {p.name: p.read_bytes() for p in (tmp_path / w / "replicates").glob("*-*.json")}
-        for w in "12"
-    )
-    assert len(one) == 4
-    assert one == two
-
-
-@pytest.mark.slow
 def test_posteriors_a_fifth_too_narrow_are_found() -> None:
     run = records(CHEAP, 300, (1.0, 0.8))
     right, wrong = (score(run[factor], SEED, 300) for factor in (1.0, 0.8))
