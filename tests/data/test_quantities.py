@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -210,7 +211,7 @@ def test_units_that_are_no_factor_of_its_own_are_refused_where_they_are_declared
 def test_declarations_stand_in_for_others_within_a_block() -> None:
     known = QUANTITIES["slip_ratio"]
     other, more = replace(known, description="mine"), replace(known, canonical="my_slip")
-    with pytest.raises(ZeroDivisionError), QUANTITIES.standing_in(other, more):
+    with suppress(ZeroDivisionError), QUANTITIES.standing_in(other, more):
         assert (QUANTITIES["slip_ratio"], QUANTITIES["my_slip"]) == (other, more)
         raise ZeroDivisionError
     assert QUANTITIES["slip_ratio"] is known
