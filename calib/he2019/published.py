@@ -14,7 +14,7 @@ Terramechanics. doi:10.1016/j.jterra.2019.07.003.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -34,28 +34,19 @@ DOI = "10.1016/j.jterra.2019.07.003"
 class Setup:
     """The experiment, by psi, mm, kN and nominal slip fractions, and Table 2's settings."""
 
-    inflation_pressures_psi: tuple[int, ...] = (18, 30, 42)
-    held_out_psi: int = 30
-    tyre_width_mm: Figure = Figure("225", "mm")
-    normal_load_kn: Figure = Figure("5", "kN")
-    speed_m_s: Figure = Figure("0.06", "m/s")
-    contact_width_mm: Figure = Figure("176", "mm")
-    contact_length_mm: Mapping[int, Figure] = field(
-        default_factory=lambda: _figures(
-            {18: ["266.56", "mm"], 30: ["201.59", "mm"], 42: ["159.43", "mm"]}
-        )
-    )
-    slip_levels: Figure = Figure("14")
-    named_slips: tuple[Figure, ...] = (Figure("0"), Figure("0.025"))
-    largest_rut_slip: Figure = Figure("0.20")
-    rebound_slip: Figure = Figure("0.30")
-    largest_water_content: Figure = Figure("0.088", "g/g")
-    genetic_settings: Mapping[str, Figure] = field(
-        default_factory=lambda: _figures({
-            "F": ["0.4"], "CP": ["0.6"], "MP": ["0.1"], "mutation_low": ["0"],
-            "mutation_high": ["1"], "NP": ["50"], "iterations": ["4000"],
-        })
-    )  # fmt: skip
+    inflation_pressures_psi: tuple[int, ...]
+    held_out_psi: int
+    named_slips: tuple[Figure, ...]
+    contact_length_mm: Mapping[int, Figure]
+    genetic_settings: Mapping[str, Figure]
+    tyre_width_mm: Figure
+    normal_load_kn: Figure
+    speed_m_s: Figure
+    contact_width_mm: Figure
+    slip_levels: Figure
+    largest_rut_slip: Figure
+    rebound_slip: Figure
+    largest_water_content: Figure
 
 
 @dataclass(frozen=True)
@@ -97,13 +88,23 @@ def _by_pressure(number: int, method: str) -> Mapping[int, FittedTable]:
     return MappingProxyType(tables)
 
 
+def _setup(printed: Mapping[str, Any]) -> Setup:
+    lengths = _figures(printed["contact_length_mm"])
+    return Setup(
+        tuple(map(int, lengths)), printed["held_out_psi"],
+        tuple(map(Figure, printed["named_slips"])),
+        MappingProxyType({int(psi): length for psi, length in lengths.items()}),
+        _figures(printed["genetic_settings"]), **_figures(printed["figures"]),
+    )  # fmt: skip
+
+
 PUBLISHED = Published(
     bulk_density=_table(_PRINTED["bulk_density"]),
     geometric=_by_pressure(3, "geometric"),
     genetic=_by_pressure(4, "genetic"),
     pressure=_table(_PRINTED["pressure"]),
     rut_depth=_table(_PRINTED["rut_depth"]),
-    setup=Setup(),
+    setup=_setup(_PRINTED["setup"]),
 )
 
 
