@@ -22,7 +22,6 @@ from calib.models.base import Array
 from calib.models.magic_formula import magic_formula
 from calib.models.soil import rut_depth
 from calib.report.figures.gap import output_rows
-from calib.report.figures.plate import Plate, draw_all
 from calib.report.figures.style import (
     BLACK,
     BLUE,
@@ -35,6 +34,8 @@ from calib.report.figures.style import (
     SKY,
     SMALLEST_PT,
     VERMILION,
+    Plate,
+    draw_all,
     legend_below,
     note,
     panels,

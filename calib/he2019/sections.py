@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
 
@@ -37,7 +37,6 @@ from calib.he2019.gaps import (
 )
 from calib.he2019.published import DOI
 from calib.models import get_model
-from calib.report.figures.plate import Plate
 from calib.report.gap_words import gap_verdict, short_name
 from calib.report.labels import MINUS, odds_text, percent, percent_range, unbroken
 from calib.report.markup import unit_html
@@ -46,6 +45,9 @@ from calib.report.page.diagnosis import TONE_MARKS, render_page
 from calib.report.page.template import picture, sentences, template
 from calib.report.sections import Section, Target
 from calib.report.study import Progress, Study
+
+if TYPE_CHECKING:
+    from calib.report.figures.style import Plate
 
 # A shape beside every word.
 AUDIT_MARKS: Mapping[Verdict, str] = {

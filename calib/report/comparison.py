@@ -40,8 +40,7 @@ from calib.inference.problem import Problem, build_problem
 from calib.inference.sampler import SamplerSettings
 from calib.models import get_model
 from calib.models.base import Array
-from calib.report.figures.plate import mark
-from calib.report.figures.style import BLACK, BLUE, legend_below, panels, png_bytes, style
+from calib.report.figures.style import BLACK, BLUE, legend_below, mark, panels, png_bytes, style
 from calib.report.labels import aligned, axis_of, units_of
 from calib.report.numbers import finite, format_number
 from calib.report.page.template import data_uri, template

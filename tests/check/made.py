@@ -28,9 +28,8 @@ from calib.inference.sampler import SamplerSettings
 from calib.models import example_csv
 from calib.report.comparison import write_comparison
 from calib.report.figures.bands import bands_plate
-from calib.report.figures.plate import Plate
 from calib.report.figures.posterior import learned_plate
-from calib.report.figures.style import style
+from calib.report.figures.style import Plate, style
 from calib.report.reference import NOTHING, Reference
 from calib.report.sections import Report, work_out
 from calib.report.study import OutputResult, Task

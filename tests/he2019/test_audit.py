@@ -24,7 +24,7 @@ from calib.he2019.audit import (
 from calib.he2019.figures import audit_plates
 from calib.he2019.published import PUBLISHED
 from calib.he2019.sections import audit_section, write_audit_page
-from calib.report.figures.plate import Plate
+from calib.report.figures.style import Plate
 from tests.browser import faults
 from tests.he2019.altered import flipped, printed_figures
 from tests.report.page.test_page import PNG, Reader

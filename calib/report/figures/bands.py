@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import matplotlib as mpl
@@ -17,21 +17,8 @@ from calib.data.quantities import role_of
 from calib.data.table import Table
 from calib.errors import CalibError
 from calib.models.base import Array, Model
-from calib.report.figures.plate import Plate
-from calib.report.figures.style import (
-    BLACK,
-    BLUE,
-    DASHES,
-    DOUBLE_MM,
-    EMBER,
-    GREY,
-    MIDDLE_MM,
-    ORANGE,
-    VERMILION,
-    caption,
-    legend_below,
-    panels,
-)
+from calib.report.figures import style
+from calib.report.figures.style import BLACK, BLUE, DASHES, DOTS, GREY, VERMILION, Plate, caption
 from calib.report.labels import Axis, axis_of, short
 from calib.report.reference import NOTHING, Reference
 from calib.report.rows import Group, data_word, grid, group_column, groups, held_table, x_column
@@ -41,69 +28,55 @@ from calib.validation.prediction import Bands, hits, median_change, smooth_bands
 # Lighter outwards, also in greyscale.
 FILLS = {0.95: "#dfebf5", 0.9: "#bcd6ea", 0.5: "#86b5d9"}
 
+type _Draw = Callable[[Axes, OutputResult, Group], dict[str, Any]]
 
-def scaled(axis: Axis, found: Bands) -> Bands:
+
+def _scaled(axis: Axis, found: Bands) -> Bands:
     """Convert bands from the canonical unit to that of an axis."""
     ends = found.lower, found.upper
     lower, upper = ({level: axis.scale(v) for level, v in end.items()} for end in ends)
     return Bands(axis.scale(found.median), lower, upper)
 
 
-def fill_bands(ax: Axes, x: Array, mean: Bands, measured: Bands) -> dict[str, Any]:
-    """Draw median, predictive bands and the parameters' own 90 % band; return legend handles."""
-    handles: dict[str, Any] = {}
-    for level, colour in FILLS.items():
-        handles[f"{100 * level:g} % predictive"] = ax.fill_between(
-            x, measured.lower[level], measured.upper[level], color=colour, lw=0.0
-        )
-    (handles["median"],) = ax.plot(x, mean.median, color=BLUE, lw=1.4)
-    for edge in (mean.lower[0.9], mean.upper[0.9]):
-        (handles["90 %, parameters only"],) = ax.plot(x, edge, color=BLUE, lw=0.8, ls=DASHES[1])
-    return handles
-
-
-def scatter_points(ax: Axes, x: Array, y: Array, *, held: bool) -> Any:
+def _points(ax: Axes, x: Array, y: Array, *, held: bool = False) -> Any:
     """Draw measured points: filled where fitted, ringed where held out."""
     if held:
-        return ax.plot(
-            x, y, "o", ms=5.0, mfc="white", mec=VERMILION, mew=1.3, ls="none", zorder=5
-        )[0]  # fmt: skip
-    return ax.plot(x, y, "o", ms=3.6, color=BLACK, mec="white", mew=0.4, ls="none", zorder=4)[0]
+        return ax.plot(x, y, "o", ms=5.0, mfc="white", mec=VERMILION, mew=1.3, zorder=5)[0]
+    return ax.plot(x, y, "o", ms=3.6, color=BLACK, zorder=4, **DOTS)[0]
 
 
-def _one_panel_each(
-    shown: list[Group], height: float, bottom: float, top: float
-) -> tuple[Figure, Any, int]:
-    """Return a figure with a panel for each group, the panels, and how many are in a row."""
+def _by_group(result: OutputResult, shown: list[Group], draw: _Draw, **layout: Any) -> Figure:
+    """Draw a panel for each group, a legend below all."""
     cols = min(3, len(shown))
-    figure, axes = panels(
-        -(-len(shown) // cols), cols, height=height, width=DOUBLE_MM if cols > 1 else MIDDLE_MM,
-        gap_x=3.0, gap_y=8.0, sharex=True, sharey=True, bottom=bottom, top=top,
-    )  # fmt: skip
-    for ax, group in zip(axes.flat, shown, strict=False):
-        ax.set_title(group.title, color=EMBER if group.held else BLACK,
-                     weight="bold" if group.held else "normal")  # fmt: skip
-    for ax in axes.flat[len(shown) :]:
-        ax.set_visible(False)
-    return figure, axes, cols
-
-
-def bands_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Plate:
-    """Draw the predictive bands of an output along slip or pressure, beside a published fit."""
-    shown = groups(result)
-    fig, axes, cols = _one_panel_each(
-        shown, 52.0 if len(shown) > 1 else 60.0, bottom=20.0, top=7.0
+    width = style.DOUBLE_MM if cols > 1 else style.MIDDLE_MM
+    figure, axes = style.panels(
+        -(-len(shown) // cols), cols, width=width, gap_x=3.0, gap_y=8.0, sharex=True, sharey=True,
+        **layout,
     )  # fmt: skip
     handles: dict[str, Any] = {}
     for ax, group in zip(axes.flat, shown, strict=False):
-        handles |= _panel(ax, result, group, reference)
+        handles |= draw(ax, result, group)
+        weight, colour = ("bold", style.EMBER) if group.held else ("normal", BLACK)
+        ax.set_title(group.title, color=colour, weight=weight)
+    style.hide_rest(axes, len(shown))
+    output = result.calibration.problem.bound.model.output
+    style.label_outer(axes, axis_of(x_column(result)).label, axis_of(output).label)
+    style.legend_below(figure, handles, 5 if len(handles) == 5 else 4 if cols > 1 else 3)
+    return figure
+
+
+def bands_plate(result: OutputResult, reference: Reference = NOTHING) -> Plate:
+    """Draw the predictive bands of an output along slip or pressure, beside a published fit."""
+    shown = groups(result)
+
+    def draw(ax: Axes, result: OutputResult, group: Group) -> dict[str, Any]:
+        handles = _panel(ax, result, group, reference)
         ax.margins(x=0.02)
-    for ax in axes[-1]:
-        ax.set_xlabel(axis_of(x_column(result)).label)
-    for ax in axes[:, 0]:
-        ax.set_ylabel(axis_of(result.calibration.problem.bound.model.output).label)
-    legend_below(fig, handles, 4 if cols > 1 else 3)
-    return Plate(fig, "bands", _bands_caption(result, len(shown)), "Prediction and data")
+        return handles
+
+    height = 52.0 if len(shown) > 1 else 60.0
+    figure = _by_group(result, shown, draw, height=height, bottom=20.0, top=7.0)
+    return Plate(figure, "bands", _bands_caption(result, len(shown)), "Prediction and data")
 
 
 def _panel(ax: Axes, result: OutputResult, group: Group, reference: Reference) -> dict[str, Any]:
@@ -111,44 +84,47 @@ def _panel(ax: Axes, result: OutputResult, group: Group, reference: Reference) -
     x, y = x_column(result), problem.bound.model.output
     conditions = grid(result, group)
     scale, y_axis = axis_of(x).scale, axis_of(y)
-    both = (scaled(y_axis, b) for b in smooth_bands(result.calibration, conditions))
-    handles = fill_bands(ax, scale(conditions[x]), *both)
+    along = scale(conditions[x])
+    mean, measured = (_scaled(y_axis, b) for b in smooth_bands(result.calibration, conditions))
+    handles: dict[str, Any] = {
+        f"{100 * level:g} % predictive": ax.fill_between(
+            along, measured.lower[level], measured.upper[level], color=colour, lw=0.0
+        )
+        for level, colour in FILLS.items()
+    }
+    (handles["median"],) = ax.plot(along, mean.median, color=BLUE, lw=1.4)
+    for edge in (mean.lower[0.9], mean.upper[0.9]):
+        (line,) = ax.plot(along, edge, color=BLUE, lw=0.8, ls=DASHES[1])
+        handles["90 %, parameters only"] = line
     curve = reference.curve(problem.bound.model.name, conditions)
     if curve is not None:
-        (handles[f"published fit ({curve[1]})"],) = ax.plot(
-            scale(conditions[x]), y_axis.scale(curve[0]), color=ORANGE, lw=1.4, ls=DASHES[3],
-            zorder=3,
-        )  # fmt: skip
+        dashes = {"lw": 1.4, "ls": DASHES[3], "zorder": 3}
+        (line,) = ax.plot(along, y_axis.scale(curve[0]), color=style.ORANGE, **dashes)
+        handles[f"published fit ({curve[1]})"] = line
     word = data_word(result)
-    for table, rows, draws in (
-        (problem.table, group.fitted, result.posterior_predictive),
-        (held, group.held_out, result.validation.draws),
+    for table, rows, draws, name, is_held in (
+        (problem.table, group.fitted, result.posterior_predictive, "calibrated", False),
+        (held, group.held_out, result.validation.draws, "held out", True),
     ):
-        away = np.zeros(0, bool) if table is None else rows & _elsewhere(table, conditions, x)
-        if table is not None and away.any():
+        if table is None or not rows.any():
+            continue
+        away = rows & _elsewhere(table, conditions, x)
+        if away.any():
             low, high = y_axis.scale(np.nanquantile(draws[:, away], [0.05, 0.95], axis=0))
             handles["90 % at the row's own conditions"] = ax.vlines(
                 scale(table[x][away]), low, high, color=GREY, lw=3.0, alpha=0.5, zorder=3.5
             )
-    if group.fitted.any():
-        handles[f"{word}, calibrated"] = scatter_points(
-            ax, scale(problem.table[x][group.fitted]),
-            y_axis.scale(problem.table[y][group.fitted]), held=False,
-        )  # fmt: skip
-    if held is not None and group.held_out.any():
-        handles[f"{word}, held out"] = scatter_points(
-            ax, scale(held[x][group.held_out]), y_axis.scale(held[y][group.held_out]), held=True
-        )
+        at, values = scale(table[x][rows]), y_axis.scale(table[y][rows])
+        handles[f"{word}, {name}"] = _points(ax, at, values, held=is_held)
     return handles
 
 
 def _elsewhere(table: Table, drawn: Mapping[str, Array], x: str) -> NDArray[np.bool_]:
     """Which rows (n,) are at other conditions, beside x, than a curve is drawn at."""
-    apart = [
-        ~np.isclose(table[name], values[0], rtol=1e-6, atol=1e-12)
-        for name, values in drawn.items() if name != x
-    ]  # fmt: skip
-    return np.any(apart, axis=0) if apart else np.zeros(len(table), dtype=np.bool_)
+    apart = np.zeros(len(table), dtype=np.bool_)
+    for name in drawn.keys() - {x}:
+        apart |= ~np.isclose(table[name], drawn[name][0], rtol=1e-6, atol=1e-12)
+    return apart
 
 
 def _covered(result: OutputResult) -> dict[str, Any]:
@@ -169,8 +145,7 @@ def _bands_caption(result: OutputResult, shown: int) -> str:
     if held is not None:
         miss = facts["axis"].scale(result.validation.scores.median - result.validation.observed)
         i, where = int(np.nanargmax(np.abs(miss))), axis_of(x_column(result))
-        at = where.factor * held[x_column(result)][i]
-        worst = {"axis": where, "at": at, "miss": miss[i]}
+        worst = {"axis": where, "at": where.factor * held[x_column(result)][i], "miss": miss[i]}
     column = group_column(result)
     total = 0 if column is None else np.unique(result.task.table[column]).size
     if column is not None and 0 < shown < total:
@@ -197,36 +172,26 @@ def _drawn_at(result: OutputResult) -> list[str]:
     return said
 
 
-def prior_predictive_plate(result: OutputResult) -> Plate:
+def prior_predictive_plate(result: OutputResult, reference: Reference = NOTHING) -> Plate:
     """Draw bands of prior predictive measurements at the calibration conditions."""
     problem = result.calibration.problem
     y_axis = axis_of(problem.bound.model.output)
     shown = [g for g in groups(result) if g.fitted.any()]
-    fig, axes, _ = _one_panel_each(shown, 44.0, bottom=16.0, top=6.0)
-    handles: dict[str, Any] = {}
-    for ax, group in zip(axes.flat, shown, strict=False):
-        handles |= _prior_panel(ax, result, group)
-    for ax in axes[-1]:
-        ax.set_xlabel(axis_of(x_column(result)).label)
-    for ax in axes[:, 0]:
-        ax.set_ylabel(y_axis.label)
-    y = y_axis.scale(problem.observed)
+    figure = _by_group(result, shown, _prior_panel, height=44.0, bottom=16.0, top=6.0)
+    y, ax = y_axis.scale(problem.observed), figure.axes[0]
     # A heavy prior tail would flatten the data: the axis ends at four times their range.
     reach = 4.0 * max(float(np.ptp(y)), 0.1 * float(np.abs(y).max()))
-    low, high = axes[0, 0].get_ylim()
+    low, high = ax.get_ylim()
     floor = 0.0 if y.min() >= 0.0 and problem.bound.model.response == "log" else y.min() - reach
-    axes[0, 0].set_ylim(max(low, floor), min(high, y.max() + reach))
-    legend_below(fig, handles, 5)
+    ax.set_ylim(max(low, floor), min(high, y.max() + reach))
     before, after = (
-        np.nanquantile(draws, [0.025, 0.975], axis=0)
+        np.diff(np.nanquantile(draws, [0.025, 0.975], axis=0), axis=0)
         for draws in (result.prior_predictive, result.posterior_predictive)
     )
-    said = caption(
-        "prior_predictive", inside=hits(result.prior_predictive, problem.observed, 0.95),
-        fitted=problem.observed.size,
-        ratio=float(np.median(before[1] - before[0]) / np.median(after[1] - after[0])),
-    )  # fmt: skip
-    return Plate(fig, "prior_predictive", said, "What the priors alone expect")
+    inside = hits(result.prior_predictive, problem.observed, 0.95)
+    ratio = float(np.median(before) / np.median(after))
+    said = caption("prior_predictive", inside=inside, fitted=y.size, ratio=ratio)
+    return Plate(figure, "prior_predictive", said, "What the priors alone expect")
 
 
 def _prior_panel(ax: Axes, result: OutputResult, group: Group) -> dict[str, Any]:
@@ -234,7 +199,7 @@ def _prior_panel(ax: Axes, result: OutputResult, group: Group) -> dict[str, Any]
     x, scale = x_column(result), axis_of(x_column(result)).scale
     y_axis = axis_of(problem.bound.model.output)
     conditions = grid(result, group)
-    expected = scaled(y_axis, smooth_bands(result.calibration, conditions, prior=True)[1])
+    expected = _scaled(y_axis, smooth_bands(result.calibration, conditions, prior=True)[1])
     along = scale(conditions[x])
     handles: dict[str, Any] = {
         f"prior, {100 * level:g} %": ax.fill_between(
@@ -243,10 +208,8 @@ def _prior_panel(ax: Axes, result: OutputResult, group: Group) -> dict[str, Any]
         for level, grey in zip(FILLS, ("#ececec", "#d9d9d9", "#bdbdbd"), strict=True)
     }
     (handles["prior median"],) = ax.plot(along, expected.median, color=GREY, lw=1.3)
-    handles[data_word(result)] = scatter_points(
-        ax, scale(problem.table[x][group.fitted]), y_axis.scale(problem.observed[group.fitted]),
-        held=False,
-    )  # fmt: skip
+    at, values = scale(problem.table[x][group.fitted]), problem.observed[group.fitted]
+    handles[data_word(result)] = _points(ax, at, y_axis.scale(values))
     return handles
 
 
@@ -254,7 +217,7 @@ def _prior_panel(ax: Axes, result: OutputResult, group: Group) -> dict[str, Any]
 _WATER = ListedColormap(mpl.colormaps["YlGnBu"](np.linspace(0.35, 1.0, 128)))
 
 
-def density_plate(result: OutputResult) -> Plate:
+def density_plate(result: OutputResult, reference: Reference = NOTHING) -> Plate:
     """Draw density against cone index, coloured by water content, and predicted against observed.
 
     A CalibError says that the model is not of density by cone index and water content.
@@ -265,10 +228,10 @@ def density_plate(result: OutputResult) -> Plate:
             "the figure is of density models of cone index and water content",
             hint="draw `bands_plate` of other models",
         )
-    fig, axes = panels(1, 2, height=64.0, bottom=22.0, left=14.0, gap_x=30.0, right=3.0, top=4.0)
+    fig, axes = style.panels(1, 2, height=64.0, bottom=22.0, gap_x=30.0, top=4.0)
     handles = _against_cone_index(axes[0, 0], fig, result, *columns)
     handles |= draw_predicted_observed(axes[0, 1], result)
-    legend_below(fig, handles, 3)
+    style.legend_below(fig, handles, 3)
     facts = _covered(result)
     change = [facts["axis"].factor * median_change(result.calibration, name) for name in columns]
     miss = result.validation.scores.max_relative_error
@@ -291,35 +254,24 @@ def _against_cone_index(
     problem = result.calibration.problem
     ci, w = problem.table[cone], axis_of(water).scale(problem.table[water])
     of_cone, of_density = axis_of(cone), axis_of(problem.bound.model.output)
-    handles: dict[str, Any] = {}
-    points = ax.scatter(
-        of_cone.scale(ci), of_density.scale(problem.observed), c=w, cmap=_WATER, s=17,
-        edgecolor=BLACK, linewidth=0.4, zorder=4,
-    )  # fmt: skip
+    look: Any = {"cmap": _WATER, "s": 17, "edgecolor": BLACK, "linewidth": 0.4, "zorder": 4}
+    points = ax.scatter(of_cone.scale(ci), of_density.scale(problem.observed), c=w, **look)
     x = np.linspace(ci.min(), ci.max(), 60)
+    handles: dict[str, Any] = {}
     for quantile, dashes in zip((0.1, 0.5, 0.9), DASHES, strict=False):
         at = float(np.quantile(problem.table[water], quantile))
-        mean, measured = (
-            scaled(of_density, b)
-            for b in smooth_bands(result.calibration, {cone: x, water: np.full_like(x, at)})
-        )
+        found = smooth_bands(result.calibration, {cone: x, water: np.full_like(x, at)})
+        mean, measured = (_scaled(of_density, b) for b in found)
         shown = axis_of(water).factor * at
+        where = f"water {short(shown)} {axis_of(water).unit}"
         colour = points.to_rgba(np.array([shown]))[0]
         (line,) = ax.plot(of_cone.scale(x), mean.median, ls=dashes, lw=1.4, color=colour)
-        handles[f"median, water {short(shown)} {axis_of(water).unit}"] = line
+        handles[f"median, {where}"] = line
         if quantile == 0.5:
-            handles[f"90 % predictive, water {short(shown)} {axis_of(water).unit}"] = (
-                ax.fill_between(
-                    of_cone.scale(x),
-                    measured.lower[0.9],
-                    measured.upper[0.9],
-                    color="#e4e4e4",
-                    lw=0.0,
-                    zorder=0,
-                )
-            )
-    ax.set_xlabel(of_cone.label)
-    ax.set_ylabel(of_density.label)
+            ends = measured.lower[0.9], measured.upper[0.9]
+            band = ax.fill_between(of_cone.scale(x), *ends, color=style.BAND, lw=0.0, zorder=0)
+            handles[f"90 % predictive, {where}"] = band
+    ax.set(xlabel=of_cone.label, ylabel=of_density.label)
     bar = fig.colorbar(points, ax=ax, cax=ax.inset_axes((1.03, 0.0, 0.035, 1.0)))
     bar.set_label(axis_of(water).label)
     bar.outline.set_linewidth(0.4)
@@ -334,24 +286,26 @@ def draw_predicted_observed(ax: Axes, result: OutputResult) -> dict[str, Any]:
     low, high = axis.scale(np.nanquantile(v.draws, [0.05, 0.95], axis=0))
     median = axis.scale(np.nanmedian(v.draws, axis=0))
     inside = (observed >= low) & (observed <= high)
-    held = held_table(result) is not None
-    word = data_word(result)
+    which = "each left out" if held_table(result) is None else "held out"
     handles: dict[str, Any] = {}
-    for part, colour, shape, name in (
-        (inside, BLACK, "o", f"{word}, {'held out' if held else 'each left out'}, 90 % band"),
-        (~inside, VERMILION, "s", "outside its 90 % band"),
+    for part, colour, line, shape, name in (
+        (inside, BLACK, GREY, "o", f"{data_word(result)}, {which}, 90 % band"),
+        (~inside, VERMILION, VERMILION, "s", "outside its 90 % band"),
     ):
         if part.any():
-            handles[name] = ax.errorbar(
-                observed[part], median[part],
-                yerr=[(median - low)[part], (high - median)[part]],
-                fmt=shape, ms=3.6, color=colour, ecolor=colour if shape == "s" else GREY,
-                elinewidth=0.7, mec="white", mew=0.4,
-            )  # fmt: skip
+            bars = [(median - low)[part], (high - median)[part]]
+            look: Any = {
+                "fmt": shape,
+                "ms": 3.6,
+                "color": colour,
+                "ecolor": line,
+                "elinewidth": 0.7,
+            }
+            handles[name] = ax.errorbar(observed[part], median[part], yerr=bars, **look, **DOTS)
     everything = np.append(observed, median)
     ends = [everything.min(), everything.max()]
     (handles["observed = predicted"],) = ax.plot(ends, ends, color=GREY, lw=0.9, ls=DASHES[2])
     ax.xaxis.set_major_locator(MaxNLocator(5))
-    ax.set_xlabel(f"Observed {axis.name.lower()} ({axis.unit})")
-    ax.set_ylabel(f"Predicted {axis.name.lower()} ({axis.unit})")
+    name, unit = axis.name.lower(), axis.unit
+    ax.set(xlabel=f"Observed {name} ({unit})", ylabel=f"Predicted {name} ({unit})")
     return handles

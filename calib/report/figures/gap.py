@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -25,20 +25,17 @@ from calib.gap.constants import ALIKE
 from calib.gap.document import Design, GapDocument
 from calib.gap.mixture import Region
 from calib.models.base import Array
-from calib.report.figures.plate import Plate, draw_all, marked
+from calib.report.figures import style
 from calib.report.figures.style import (
     BLACK,
     BLUE,
-    CYCLE,
-    EMBER,
+    DOTS,
     GREY,
-    MARKERS,
     ORANGE,
     SKY,
     SMALLEST_PT,
     VERMILION,
-    legend_below,
-    note,
+    Plate,
     panels,
 )
 from calib.report.gap_verdict import TIE
@@ -98,13 +95,10 @@ def output_rows(d: GapDocument) -> list[OutputRows]:
     for o in d.outputs:
         axis = Notation(d).axis(o.name)
         values = (o.measured, o.before, o.after, o.noise_sd, o.gap, o.gap_sd)
-        measured, before, after, noise, gap, sd = (axis.scale(np.array(v)) for v in values)
-        gathered.append(
-            OutputRows(
-                o.name, axis, np.array(o.rows), measured, before, after, noise, gap, sd,
-                np.array(o.probability),
-            )
-        )  # fmt: skip
+        scaled = (axis.scale(np.array(v)) for v in values)
+        found = np.array(o.rows), *scaled, np.array(o.probability)
+        rows = OutputRows(o.name, axis, *found)
+        gathered.append(rows)
     return gathered
 
 
@@ -129,13 +123,9 @@ def panel_groups(
     if distinct.size <= 4:
         return [(f"{axis.value_text(p)} {axis.unit}", pressure[rows] == p) for p in distinct]
     edges = np.quantile(pressure, [0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0])
-    groups = []
-    for low, high in pairwise(edges):
-        inside = (pressure[rows] >= low) & (pressure[rows] <= high)
-        if low > edges[0]:
-            inside &= pressure[rows] > low
-        groups.append((axis.range_text(np.array([low, high])), inside))
-    return groups
+    group = np.searchsorted(edges[1:-1], pressure[rows])
+    titles = [axis.range_text(np.array(ends)) for ends in pairwise(edges)]
+    return [(title, group == k) for k, title in enumerate(titles)]
 
 
 # Where
@@ -145,14 +135,12 @@ def where_plate(d: GapDocument, say: Words) -> Plate:
     """Draw the gap over slip, a panel for each inflation pressure."""
     outputs = output_rows(d)
     columns = max(len(panel_groups(d, o.rows)) for o in outputs)
-    fig, axes = panels(
-        len(outputs), columns, height=44.0, left=16.0, right=4.0, top=6.0, bottom=25.0, gap_x=5.0,
-        gap_y=7.0, sharex=True, sharey="row",
-    )  # fmt: skip
+    margins = {"left": 16.0, "right": 4.0, "bottom": 25.0, "gap_x": 5.0, "gap_y": 7.0}
+    fig, axes = panels(len(outputs), columns, height=44.0, sharex=True, sharey="row", **margins)
     name, slip = _abscissa(d), _column(d, "slip") or ""
     x_axis = axis_of(name)
     x = x_axis.scale(np.array(d.conditions[name]))
-    for i, (row, own) in enumerate(zip(axes, outputs, strict=True)):
+    for row, own in zip(axes, outputs, strict=True):
         limits = _limits(own)
         marked = [r for r in d.regions if r.output == own.name and slip in r.conditions][:1]
         for ax, (title, mask) in zip(row, panel_groups(d, own.rows), strict=True):
@@ -163,11 +151,11 @@ def where_plate(d: GapDocument, say: Words) -> Plate:
             ax.set_ylim(*limits)
             if limits[1] > 0.01:
                 ax.ticklabel_format(axis="y", style="plain")
-            if i == 0:
+            if ax in axes[0]:
                 ax.set_title(title, loc="left", fontweight="bold")
-            if i == len(outputs) - 1:
-                ax.set_xlabel(x_axis.label)
         row[0].set_ylabel(f"Gap in {say.n.output(own.name)} ({own.axis.unit})")
+    for ax in axes[-1]:
+        ax.set_xlabel(x_axis.label)
     _key(fig, regions=any(slip in r.conditions for r in d.regions))
     return Plate(fig, "where", say("caption_where", outputs), "Where: the gap over slip")
 
@@ -185,11 +173,10 @@ def conditions_plate(d: GapDocument, say: Words) -> Plate | None:
     if not names:
         return None
     outputs = output_rows(d)
-    fig, axes = panels(
-        len(outputs), len(names), height=34.0, left=19.0, right=4.0, top=4.0, bottom=28.0,
-        gap_x=3.0, gap_y=5.0, sharex="col", sharey="row",
-    )  # fmt: skip
-    for i, (row, own) in enumerate(zip(axes, outputs, strict=True)):
+    margins = {"left": 19.0, "right": 4.0, "top": 4.0, "bottom": 28.0, "gap_x": 3.0, "gap_y": 5.0}
+    shared: Any = {"sharex": "col", "sharey": "row"}
+    fig, axes = panels(len(outputs), len(names), height=34.0, **margins, **shared)
+    for row, own in zip(axes, outputs, strict=True):
         ones = np.ones_like(own.noise)
         scaled = replace(own, noise=ones, gap=own.gap / own.noise, sd=own.sd / own.noise)
         for ax, name in zip(row, names, strict=True):
@@ -200,15 +187,16 @@ def conditions_plate(d: GapDocument, say: Words) -> Plate | None:
                     _span(ax, region, axis, values)
             _points(ax, axis.scale(values[own.rows]), scaled, ones > 0.0)
             ax.set_ylim(*_limits(scaled))
-            if i == len(outputs) - 1:
-                levels = d.covariates.get(name)
-                ax.set_xlabel(axis.name if levels else f"{axis.name}\n({axis.unit})")
-                if levels:
-                    ax.set_xticks(range(len(levels)), levels, rotation=90)
-                    continue
-                ax.xaxis.set_major_locator(MaxNLocator(3))
-                ax.ticklabel_format(axis="x", style="plain", useOffset=False)
         row[0].set_ylabel(f"Gap in {say.n.output(own.name)}\n(noise sd)")
+    for ax, name in zip(axes[-1], names, strict=True):
+        axis, levels = axis_of(name), d.covariates.get(name)
+        if levels:
+            ax.set_xlabel(axis.name)
+            ax.set_xticks(range(len(levels)), levels, rotation=90)
+        else:
+            ax.set_xlabel(f"{axis.name}\n({axis.unit})")
+            ax.xaxis.set_major_locator(MaxNLocator(3))
+            ax.ticklabel_format(axis="x", style="plain", useOffset=False)
     _key(fig, regions=bool(d.regions))
     caption = say("caption_where_conditions")
     return Plate(fig, "where_conditions", caption, "Where: the gap over conditions")
@@ -237,25 +225,19 @@ def _noise_band(ax: Axes, x: Array, noise: Array, width: float = 1.0) -> None:
 def _span(ax: Axes, region: Region, axis: Axis, values: Array) -> None:
     low, high = (float(v) for v in axis.scale(np.array(next(iter(region.conditions.values())))))
     # A region at a single value still needs a width.
-    least = 0.03 * float(np.ptp(axis.scale(values)))
-    if high - low < least:
-        low, high = low - 0.5 * least, high + 0.5 * least
+    short_by = max(0.0, 0.03 * float(np.ptp(axis.scale(values))) - (high - low))
+    low, high = low - 0.5 * short_by, high + 0.5 * short_by
     ax.axvspan(low, high, facecolor=ORANGE, alpha=0.13, lw=0.0, zorder=0)
-    ax.plot(
-        [low, high], [0.985, 0.985], transform=ax.get_xaxis_transform(), color=VERMILION, lw=2.2,
-        solid_capstyle="butt", clip_on=False,
-    )  # fmt: skip
+    edge: Any = {"color": VERMILION, "lw": 2.2, "solid_capstyle": "butt", "clip_on": False}
+    ax.plot([low, high], [0.985, 0.985], transform=ax.get_xaxis_transform(), **edge)
 
 
 def _points(ax: Axes, x: Array, own: OutputRows, mask: NDArray[np.bool_]) -> None:
     ax.axhline(0.0, color=GREY, lw=0.6, zorder=1)
-    ax.errorbar(
-        x, own.gap[mask], _Z * own.sd[mask], fmt="none", ecolor=BLACK, elinewidth=0.6, zorder=2
-    )
-    ax.scatter(
-        x, own.gap[mask], c=own.probability[mask], cmap=_PROBABLE, norm=_NORM, s=20.0,
-        edgecolors=BLACK, linewidths=0.6, zorder=3,
-    )  # fmt: skip
+    gap, half = own.gap[mask], _Z * own.sd[mask]
+    ax.errorbar(x, gap, half, fmt="none", ecolor=BLACK, elinewidth=0.6, zorder=2)
+    look: Any = {"s": 20.0, "edgecolors": BLACK, "linewidths": 0.6, "zorder": 3}
+    ax.scatter(x, gap, c=own.probability[mask], cmap=_PROBABLE, norm=_NORM, **look)
 
 
 def _key(fig: Figure, *, regions: bool) -> None:
@@ -266,13 +248,16 @@ def _key(fig: Figure, *, regions: bool) -> None:
     scale.set_ticks([0.0, 0.5, 1.0])
     scale.outline.set_linewidth(0.5)
     bar.set_title(f"Probability that the gap exceeds the noise ({NO_UNIT})", fontsize=7.0, pad=2.5)
-    handles = [Patch(color=_BAND), Patch(facecolor="#fdf3dc", edgecolor=VERMILION, lw=0.8)]
-    labels = ["±1 noise sd of a single reading", "region with a probable gap"]
-    shown = 2 if regions else 1
-    fig.legend(
-        handles[:shown], labels[:shown], loc="lower left", ncols=1, labelspacing=0.4,
-        bbox_to_anchor=(0.09, 2.5 / height), borderaxespad=0.0,
-    )  # fmt: skip
+    handles = {"±1 noise sd of a single reading": Patch(color=_BAND)}
+    if regions:
+        region = Patch(facecolor="#fdf3dc", edgecolor=VERMILION, lw=0.8)
+        handles["region with a probable gap"] = region
+    corner: Any = {
+        "loc": "lower left",
+        "bbox_to_anchor": (0.09, 2.5 / height),
+        "borderaxespad": 0.0,
+    }
+    fig.legend(list(handles.values()), list(handles), labelspacing=0.4, **corner)
 
 
 # Which
@@ -287,29 +272,24 @@ def which_plate(d: GapDocument, say: Words) -> Plate:
     labels = [textwrap.fill(short_name(e.name), 38) for e in shown]
     rows = np.maximum(1.0, [0.66 * (1 + label.count("\n")) for label in labels])
     total = float(rows.sum())
-    fig, axes = panels(1, 1, height=5.2 * total + 3.0, left=66.0, right=16.0, top=3.0, bottom=10.0)
+    margins = {"left": 66.0, "right": 16.0, "top": 3.0}
+    fig, axes = panels(1, 1, height=5.2 * total + 3.0, **margins)
     ax = axes[0, 0]
     y = total - np.cumsum(rows) + 0.5 * rows
     for yi, e in zip(y, shown, strict=True):
-        leading = e in tied
-        ax.barh(
-            yi, e.probability, edgecolor=BLACK if leading else "none", lw=0.5, height=0.66,
-            color=BLUE if e is d.best else SKY if leading else "#c9c9c9",
-            hatch="///" if leading and len(tied) > 1 else None,
-        )  # fmt: skip
-        ax.text(
-            e.probability + 0.01, yi, chance(e.probability), va="center", fontsize=7.0,
-            fontweight="bold" if leading else "normal",
-        )  # fmt: skip
+        leading, p = e in tied, e.probability
+        edge, weight = (BLACK, "bold") if leading else ("none", "normal")
+        colour = BLUE if e is d.best else SKY if leading else "#c9c9c9"
+        hatch = "///" if leading and len(tied) > 1 else None
+        ax.barh(yi, p, height=0.66, color=colour, edgecolor=edge, lw=0.5, hatch=hatch)
+        ax.text(p + 0.01, yi, chance(p), va="center", fontsize=7.0, fontweight=weight)
     ax.set_yticks(y, labels, linespacing=0.95)
-    ax.set_ylim(-0.1, total + 0.1)
-    ax.set_xlim(0.0, 1.0)
+    ax.set(xlabel=f"Probability ({NO_UNIT})", xlim=(0.0, 1.0), ylim=(-0.1, total + 0.1))
     ax.axvline(0.5, color=GREY, lw=0.7, ls=(0, (4, 2)), zorder=0)
     ax.tick_params(axis="y", length=0.0)
-    ax.set_xlabel(f"Probability ({NO_UNIT})")
     if len(tied) > 1:
         read = "read them as a tie" if d.best.probability < 0.5 else "any of them may be right"
-        note(ax, f"hatched: not far apart,\n{read}", x=0.98, y=0.05, color=BLACK)
+        style.note(ax, f"hatched: not far apart,\n{read}", x=0.98, y=0.05, color=BLACK)
     rest = sum(e.probability for e in others if e.name not in _SPECIAL)
     caption = say("caption_which", tied, len(others), rest)
     return Plate(fig, "which", caption, "Which: the hypotheses")
@@ -318,27 +298,22 @@ def which_plate(d: GapDocument, say: Words) -> Plate:
 def left_over_plate(d: GapDocument, say: Words) -> Plate:
     """Draw standardised residuals of the best hypothesis over slip and run order."""
     columns = [c for role in ("slip", "order") if (c := _column(d, role))] or [_abscissa(d)]
-    fig, axes = panels(
-        1, len(columns), height=44.0, left=13.0, right=4.0, top=6.0, bottom=16.0, gap_x=6.0,
-        sharey=True,
-    )  # fmt: skip
+    margins = {"left": 13.0, "right": 4.0, "bottom": 16.0, "gap_x": 6.0}
+    fig, axes = panels(1, len(columns), height=44.0, sharey=True, **margins)
     handles = {}
     for ax, column in zip(axes[0], columns, strict=True):
         axis, values = axis_of(column), np.array(d.conditions[column])
         ax.axhspan(-2.0, 2.0, color="#eeeeee", lw=0.0, zorder=0)
         ax.axhline(0.0, color=GREY, lw=0.6)
-        for k, o in enumerate(d.outputs):
-            (handles[say.n.output(o.name)],) = ax.plot(
-                axis.scale(values[list(o.rows)]), o.residual, MARKERS[k], color=CYCLE[k],
-                mec="white", mew=0.4, ms=4.6,
-            )  # fmt: skip
+        for o, marker, colour in zip(d.outputs, style.MARKERS, style.CYCLE, strict=False):
+            x, look = axis.scale(values[list(o.rows)]), {"color": colour, "ms": 4.6, **DOTS}
+            (handles[say.n.output(o.name)],) = ax.plot(x, o.residual, marker, **look)
         ax.set_xlabel(axis.label)
         ax.set_title(f"Along {axis.name.lower()}", loc="left")
     sizes = np.abs(np.concatenate([o.residual for o in d.outputs]))
     top = max(2.6, 1.1 * float(np.nanmax(sizes)))
-    axes[0, 0].set_ylim(-top, top)
-    axes[0, 0].set_ylabel("Residual (noise sd)")
-    legend_below(fig, handles, 3)
+    axes[0, 0].set(ylabel="Residual (noise sd)", ylim=(-top, top))
+    style.legend_below(fig, handles, 3)
     caption = say("caption_left_over", int((sizes > 2.0).sum()), sizes.size)
     return Plate(fig, "left_over", caption, "What is left after the best hypothesis")
 
@@ -348,36 +323,32 @@ def placebo_plate(d: GapDocument, say: Words) -> Plate:
     left = {e.name: e.left for e in d.explanations if e.left is not None}
     order = sorted(left, key=lambda name: left[name])
     removed = {name: 1.0 - value / d.before for name, value in left.items()}
-    fig, axes = panels(
-        1, 1, height=4.2 * len(order) + 3.0, left=62.0, right=16.0, top=7.0, bottom=10.0
-    )
+    margins = {"left": 62.0, "right": 16.0, "top": 7.0}
+    fig, axes = panels(1, 1, height=4.2 * len(order) + 3.0, **margins)
     ax = axes[0, 0]
     y = np.arange(len(order))[::-1]
     for yi, name in zip(y, order, strict=True):
-        best = name == d.best.name
-        colour = BLUE if best else ORANGE if name in ("unknown", "parameter_shift") else GREY
+        marker, size, weight = ("D", 5.5, "bold") if name == d.best.name else ("o", 4.0, "normal")
+        others = ORANGE if name in ("unknown", "parameter_shift") else GREY
+        colour = BLUE if name == d.best.name else others
         ax.plot([left[name], d.before], [yi, yi], color="#d4d4d4", lw=1.0, zorder=1)
-        ax.plot(left[name], yi, "D" if best else "o", color=colour, ms=5.5 if best else 4.0,
-                zorder=3)  # fmt: skip
-        ax.text(
-            1.015, yi, f"{100.0 * removed[name]:.0f} %".replace("-", MINUS), fontsize=7.0,
-            transform=ax.get_yaxis_transform(), va="center",
-            fontweight="bold" if best else "normal",
-        )  # fmt: skip
+        ax.plot(left[name], yi, marker, color=colour, ms=size, zorder=3)
+        text, beside = f"{100.0 * removed[name]:.0f} %".replace("-", MINUS), (1.015, yi)
+        how = {"va": "center", "fontsize": 7.0, "fontweight": weight}
+        ax.text(*beside, text, transform=ax.get_yaxis_transform(), **how)
     ax.axvline(1.0, color=BLACK, lw=0.8, ls=(0, (1, 1)), zorder=0)
     ax.axvline(d.before, color=VERMILION, lw=1.0, zorder=0)
     high, low = max(d.before, *left.values()), min(1.0, *left.values())
     pad = 0.06 * max(high - low, 0.3)
-    ax.set_xlim(low - pad, high + pad)
-    top = len(order) - 0.3
-    ax.text(1.0, top, "noise", ha="center", va="bottom", fontsize=7.0)
+    top, above = len(order) - 0.3, {"ha": "center", "va": "bottom", "fontsize": 7.0}
+    ax.text(1.0, top, "noise", **above)
     if d.before - 1.0 > 0.12 * (high - low + 2.0 * pad):
-        ax.text(d.before, top, "simulator", ha="center", va="bottom", fontsize=7.0, color=EMBER)
+        ax.text(d.before, top, "simulator", color=style.EMBER, **above)
     ax.text(1.015, 1.0, "removed", transform=ax.transAxes, va="bottom", fontsize=7.0, color=GREY)
     ax.set_yticks(y, [textwrap.fill(short_name(name), 38) for name in order], linespacing=0.85)
-    ax.set_ylim(-0.6, len(order) - 0.4)
-    ax.tick_params(axis="y", length=0.0)
+    ax.set(xlim=(low - pad, high + pad), ylim=(-0.6, len(order) - 0.4))
     ax.set_xlabel("Residual on the field rows, rms over the noise (noise sd)")
+    ax.tick_params(axis="y", length=0.0)
     runner = next((name for name in order if name not in (*_SPECIAL, d.best.name)), None)
     shown = {name: max(part, 0.0) for name, part in removed.items()}
     caption = say("caption_placebo", shown, runner)
@@ -399,23 +370,24 @@ def isolability_plate(d: GapDocument, say: Words) -> Plate | None:
     # Names stand to the left of the matrix and, turned, below it: 1.45 mm a letter.
     margin = 5.0 + 1.45 * max(len(line) for w in words for line in w.splitlines())
     bottom = max(margin, 14.0)
-    fig, axes = panels(
-        1, 3, height=side, left=margin, right=4.0, top=6.0, bottom=bottom, gap_x=6.0, sharey=False
-    )
-    total, height = fig.get_figwidth() * 25.4, fig.get_figheight() * 25.4
     # The matrix is square; the two strips share its rows.
-    width = min(side, 86.0)
-    strip = 0.5 * (total - margin - 4.0 - 16.0 - width)
-    left = margin
-    for ax, w in zip(axes[0], (width, strip, strip), strict=True):
-        ax.set_position((left / total, bottom / height, w / total, side / height))
-        left += w + 8.0
+    square = min(side, 86.0)
+    strip = 0.5 * (style.DOUBLE_MM - margin - 20.0 - square)
+    fig, axes = panels(
+        1,
+        3,
+        height=side,
+        left=margin,
+        right=4.0,
+        bottom=bottom,
+        gap_x=8.0,
+        width_ratios=(square, strip, strip),
+    )
     matrix, absorbed, smallest = axes[0]
     _matrix(matrix, design, names, words)
     y = np.arange(n)
     absorbed.barh(y, [design.absorbed[name] for name in names], color=ORANGE, height=0.6)
-    absorbed.set_xlim(0.0, 1.0)
-    absorbed.set_xlabel(f"Absorbed by the\nparameters ({NO_UNIT})")
+    absorbed.set(xlabel=f"Absorbed by the\nparameters ({NO_UNIT})", xlim=(0.0, 1.0))
     size = np.array([design.detectable[name] for name in names])
     shown = np.minimum(size, 4.0)
     smallest.hlines(y, 0.0, shown, color="#c9c9c9", lw=1.0)
@@ -426,8 +398,7 @@ def isolability_plate(d: GapDocument, say: Words) -> Plate | None:
     smallest.set_xlim(0.0, max(1.25 * float(shown.max()), 1.5))
     smallest.set_xlabel("Smallest size that\nshows (noise sd)")
     for ax in (absorbed, smallest):
-        ax.set_ylim(n - 0.5, -0.5)
-        ax.set_yticks([])
+        ax.set(ylim=(n - 0.5, -0.5), yticks=[])
         ax.spines["left"].set_visible(False)
         ax.hlines(y + 0.5, *ax.get_xlim(), color="#eeeeee", lw=0.5, zorder=0)
     matrix.set_title("Similarity (cosine)", loc="left")
@@ -440,34 +411,30 @@ def isolability_plate(d: GapDocument, say: Words) -> Plate | None:
 
 
 def _matrix(ax: Axes, design: Design, names: list[str], words: list[str]) -> None:
+    """Draw the similarity of each pair once, below the diagonal."""
     n = len(names)
-    known = {frozenset((a, b)): value for a, b, value in design.likeness}
     cosine = np.full((n, n), np.nan)
-    for i, a in enumerate(names):
-        for j, b in enumerate(names[:i]):
-            cosine[i, j] = known.get(frozenset((a, b)), np.nan)
+    for a, b, value in design.likeness:
+        j, i = sorted((names.index(a), names.index(b)))
+        cosine[i, j] = value
     ax.imshow(cosine, vmin=0.0, vmax=1.0, cmap="Blues", aspect="auto")
+    frame: Any = {"fill": False, "ec": VERMILION, "lw": 1.1, "clip_on": False, "zorder": 4}
     for i, j in np.argwhere(np.isfinite(cosine)):
-        value = cosine[i, j]
-        alike = value >= ALIKE
-        ax.text(
-            j, i, f"{100.0 * value:.0f}", ha="center", va="center", fontsize=SMALLEST_PT,
-            color="white" if value > 0.6 else BLACK, fontweight="bold" if alike else "normal",
-        )  # fmt: skip
+        value, alike = cosine[i, j], cosine[i, j] >= ALIKE
+        how: Any = {
+            "color": "white" if value > 0.6 else BLACK,
+            "weight": "bold" if alike else "normal",
+        }
+        text = f"{100.0 * value:.0f}"
+        ax.text(j, i, text, ha="center", va="center", fontsize=SMALLEST_PT, **how)
         if alike:
-            corner = (j - 0.5, i - 0.5)
-            ax.add_patch(
-                Rectangle(
-                    corner, 1.0, 1.0, fill=False, ec=VERMILION, lw=1.1, clip_on=False, zorder=4
-                )
-            )
-    ax.set_yticks(np.arange(n), words, linespacing=0.95)
+            ax.add_patch(Rectangle((j - 0.5, i - 0.5), 1.0, 1.0, **frame))
     shown = max(n - 1, 1)
+    ax.set_yticks(np.arange(n), words, linespacing=0.95)
     ax.set_xticks(np.arange(shown), words[:shown], rotation=90, linespacing=0.95)
     ax.set_xlim(-0.5, max(n - 1.5, 0.5))
     ax.tick_params(length=0.0)
-    for spine in ax.spines.values():
-        spine.set_visible(False)
+    ax.spines[:].set_visible(False)
 
 
 def _ordered(design: Design) -> list[str]:
@@ -490,25 +457,25 @@ def _ordered(design: Design) -> list[str]:
 def how_far_plate(d: GapDocument, say: Words) -> Plate:
     """Draw data against predictions, errors over slip, and errors at unfitted conditions."""
     outputs = output_rows(d)
-    fig, axes = panels(
-        len(outputs), 3, height=46.0, left=15.0, right=4.0, top=6.0, bottom=17.0, gap_x=16.0,
-        gap_y=14.0,
-    )  # fmt: skip
-    column = _abscissa(d)
-    axis = axis_of(column)
-    x = axis.scale(np.array(d.conditions[column]))
+    margins = {"left": 15.0, "right": 4.0, "bottom": 17.0, "gap_x": 16.0, "gap_y": 14.0}
+    fig, axes = panels(len(outputs), 3, height=46.0, **margins)
+    axis = axis_of(_abscissa(d))
+    x = axis.scale(np.array(d.conditions[_abscissa(d)]))
     for row, own in zip(axes, outputs, strict=True):
-        word = say.n.output(own.name)
-        handles = _against(row[0], own, word)
+        handles = _against(row[0], own, say.n.output(own.name))
         _errors(row[1], x[own.rows], own)
         row[1].set_xlabel(axis.label)
         _bars(row[2], d, own)
-    axes[0, 0].set_title("Data against prediction", loc="left")
-    axes[0, 1].set_title("Error at the field rows", loc="left")
     where = "new conditions" if d.judged_on == "new conditions" else "field conditions"
-    axes[0, 2].set_title(f"Expected at {where}", loc="left")
-    legend_below(fig, handles, 4)
+    titles = "Data against prediction", "Error at the field rows", f"Expected at {where}"
+    style.set_titles(axes[:1], titles)
+    style.legend_below(fig, handles, 4)
     return Plate(fig, "how_far", say("caption_how_far"), "How far: before and after")
+
+
+_BEFORE: Mapping[str, Any] = {"marker": "s", "ls": "none", "mfc": "none", "mec": VERMILION,
+                              "mew": 0.9}  # fmt: skip
+_AFTER: Mapping[str, Any] = {"marker": "o", "color": BLUE, **DOTS}
 
 
 def _against(ax: Axes, own: OutputRows, word: str) -> dict[str, Any]:
@@ -516,26 +483,19 @@ def _against(ax: Axes, own: OutputRows, word: str) -> dict[str, Any]:
     margin = 0.05 * np.ptp(values)
     ends = np.array([values.min() - margin, values.max() + margin])
     ax.plot(ends, ends, color=GREY, lw=0.8)
-    handles: dict[str, Any] = {}
-    (handles["calibrated simulator (before)"],) = ax.plot(
-        own.before, own.measured, "s", mfc="none", mec=VERMILION, mew=0.9, ms=4.0
-    )
-    (handles["corrected (after)"],) = ax.plot(
-        own.after, own.measured, "o", color=BLUE, mec="white", mew=0.4, ms=4.4
-    )
-    ax.set_xlim(*ends)
-    ax.set_ylim(*ends)
-    ax.set_xlabel(f"Predicted {word} ({own.axis.unit})")
-    ax.set_ylabel(f"Measured {word} ({own.axis.unit})")
-    return handles
+    (before,) = ax.plot(own.before, own.measured, ms=4.0, **_BEFORE)
+    (after,) = ax.plot(own.after, own.measured, ms=4.4, **_AFTER)
+    ax.set(xlabel=f"Predicted {word} ({own.axis.unit})", xlim=ends)
+    ax.set(ylabel=f"Measured {word} ({own.axis.unit})", ylim=ends)
+    return {"calibrated simulator (before)": before, "corrected (after)": after}
 
 
 def _errors(ax: Axes, x: Array, own: OutputRows) -> None:
     before, after = own.measured - own.before, own.measured - own.after
     _noise_band(ax, x, own.noise, _Z)
     ax.vlines(x, after, before, color="#bdbdbd", lw=0.8, zorder=1)
-    ax.plot(x, before, "s", mfc="none", mec=VERMILION, mew=0.9, ms=3.6, zorder=2)
-    ax.plot(x, after, "o", color=BLUE, mec="white", mew=0.4, ms=4.2, zorder=3)
+    ax.plot(x, before, ms=3.6, zorder=2, **_BEFORE)
+    ax.plot(x, after, ms=4.2, zorder=3, **_AFTER)
     ax.set_ylabel(f"Measured minus predicted ({own.axis.unit})")
 
 
@@ -544,10 +504,8 @@ def _bars(ax: Axes, d: GapDocument, own: OutputRows) -> None:
     s, factor = d.shrink.get(own.name), own.axis.factor
     if s is None:
         ax.axis("off")
-        ax.text(
-            0.5, 0.5, "no gap that\ncould shrink", ha="center", va="center", color=GREY,
-            transform=ax.transAxes,
-        )  # fmt: skip
+        how: Any = {"ha": "center", "va": "center", "color": GREY, "transform": ax.transAxes}
+        ax.text(0.5, 0.5, "no gap that\ncould shrink", **how)
         return
     before, after, floor = (factor * v for v in (s.rmse_before, s.rmse_after, s.noise_floor))
     ax.set_ylabel(f"Error of the prediction, rms ({own.axis.unit})")
@@ -569,10 +527,8 @@ def _bars(ax: Axes, d: GapDocument, own: OutputRows) -> None:
     ax.tick_params(axis="x", length=0.0)
 
 
-type _Draw = Callable[[GapDocument, Words], Plate | None]
-
 # In reading order.
-_DRAWINGS: dict[str, _Draw] = {
+_DRAWINGS: dict[str, Callable[[GapDocument, Words], Plate | None]] = {
     "isolability": isolability_plate,
     "where": where_plate,
     "where_conditions": conditions_plate,
@@ -584,22 +540,12 @@ _DRAWINGS: dict[str, _Draw] = {
 
 
 def gap_plates(d: GapDocument, names: Sequence[str] = ()) -> list[Plate]:
-    """Draw the figures of a diagnosis, in the units of its files.
+    """Draw the figures of a diagnosis, all or some by their names, in the units of its files.
 
-    Parameters
-    ----------
-    d : GapDocument
-    names : sequence of str, optional
-        Of those to draw; all by default.
-
-    Returns
-    -------
-    list of Plate
-        In reading order. A figure that failed has ``figure=None`` and a caption saying why.
+    They are in reading order. A figure that failed has ``figure=None`` and a caption saying why.
     """
     with units_of(d.headers):
         say = Words(d)
-        plates = draw_all({
-            name: partial(_DRAWINGS[name], d, say) for name in names or _DRAWINGS
-        })  # fmt: skip
-    return marked(plates, d.label)
+        drawings = {name: partial(_DRAWINGS[name], d, say) for name in names or _DRAWINGS}
+        plates = style.draw_all(drawings)
+    return style.marked(plates, d.label)

@@ -1,4 +1,4 @@
-"""How every figure looks, and figures as files: the same bytes whatever the user's settings are.
+"""How figures look, and figures as files: the same bytes whatever the user's settings are.
 
 Sizes are for print; colours are those of Okabe & Ito (2008) and survive greyscale; whatever a
 colour says, a marker, a line style or a label says too. Ticks are placed when a figure is drawn,
@@ -8,9 +8,10 @@ so the style holds then as well.
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import dataclass, replace
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -23,10 +24,6 @@ from PIL import Image
 from calib.report.constants import DPI
 from calib.report.page.template import words
 
-if TYPE_CHECKING:
-    from calib.report.figures.plate import Plate
-
-
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 BLUE, VERMILION, PURPLE, GREY = "#0072B2", "#D55E00", "#CC79A7", "#767676"
 # Vermilion for words: dark enough on white (WCAG: 4.5 to 1).
@@ -34,6 +31,10 @@ EMBER = "#A84600"
 CYCLE = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
 MARKERS = ("o", "s", "^", "D", "v", "P")
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1.5, 1, 1.5)))
+
+# Of filled markers: a thin white edge keeps them apart.
+DOTS: Mapping[str, Any] = {"ls": "none", "mec": "white", "mew": 0.4}
+BAND = "#e4e4e4"
 
 # Widths of one, one and a half and two columns of a journal.
 SINGLE_MM, MIDDLE_MM, DOUBLE_MM = 90.0, 140.0, 190.0
@@ -97,51 +98,45 @@ def panels(
     bottom: float = 10.0,
     gap_x: float = 4.0,
     gap_y: float = 6.0,
-    sharex: bool | Literal["col", "row"] = False,
-    sharey: bool | Literal["col", "row"] = False,
-    ratios: Sequence[float] | None = None,
+    **how: Any,
 ) -> tuple[Figure, NDArray[np.object_]]:
-    """Return a figure and its panels, laid out in millimetres.
+    """Return a figure and its panels (rows, cols), laid out in millimetres.
 
-    Parameters
-    ----------
-    height : float
-        Of one panel.
-    width : float
-        Of the figure.
-    left, right, top, bottom : float
-        Margins about the panels.
-    gap_x, gap_y : float
-        Between panels.
-    sharex, sharey : bool or {"col", "row"}
-    ratios : sequence of float, optional
-        Widths of the columns, in any unit; equal by default.
-
-    Returns
-    -------
-    Figure
-    ndarray of Axes, shape (rows, cols)
+    The height is of one panel, the width of the figure; margins are about the panels, gaps between
+    them. What else is given is for `Figure.subplots`.
     """
     total = top + bottom + rows * height + (rows - 1) * gap_y
-    panel_width = (width - left - right - (cols - 1) * gap_x) / cols
     figure = Figure(figsize=(width * _MM, total * _MM))
-    axes = figure.subplots(
-        rows,
-        cols,
-        squeeze=False,
-        sharex=sharex,
-        sharey=sharey,
-        width_ratios=ratios,
-        gridspec_kw={
-            "left": left / width,
-            "right": 1.0 - right / width,
-            "bottom": bottom / total,
-            "top": 1.0 - top / total,
-            "wspace": gap_x / panel_width,
-            "hspace": gap_y / height,
-        },
+    axes = figure.subplots(rows, cols, squeeze=False, **how)
+    figure.subplots_adjust(
+        left=left / width,
+        right=1.0 - right / width,
+        bottom=bottom / total,
+        top=1.0 - top / total,
+        wspace=gap_x / ((width - left - right - (cols - 1) * gap_x) / cols),
+        hspace=gap_y / height,
     )
     return figure, np.asarray(axes, dtype=object)
+
+
+def hide_rest(axes: NDArray[np.object_], shown: int) -> None:
+    """Hide the panels that are left over after some."""
+    for ax in axes.flat[shown:]:
+        ax.set_visible(False)
+
+
+def label_outer(axes: NDArray[np.object_], x: str = "", y: str = "") -> None:
+    """Label the panels below and to the left, which share their axes with the others."""
+    for ax in axes[-1]:
+        ax.set_xlabel(x)
+    for ax in axes[:, 0]:
+        ax.set_ylabel(y)
+
+
+def set_titles(axes: NDArray[np.object_], titles: Iterable[str]) -> None:
+    """Write a title above each panel, at its left."""
+    for ax, title in zip(axes.flat, titles, strict=True):
+        ax.set_title(title, loc="left")
 
 
 def legend_below(figure: Figure, handles: Mapping[str, Any], ncols: int) -> None:
@@ -159,10 +154,8 @@ def caption(figure: str, **facts: Any) -> str:
 
 def note(ax: Axes, text: str, *, x: float = 0.03, y: float = 0.97, **kwargs: Any) -> None:
     """Write a remark into a corner of a panel; its upper left by default."""
-    ax.text(
-        x, y, text, transform=ax.transAxes, va="top" if y > 0.5 else "bottom",
-        ha="left" if x < 0.5 else "right", fontsize=SMALLEST_PT, **kwargs,
-    )  # fmt: skip
+    kwargs |= {"va": "top" if y > 0.5 else "bottom", "ha": "left" if x < 0.5 else "right"}
+    ax.text(x, y, text, transform=ax.transAxes, fontsize=SMALLEST_PT, **kwargs)
 
 
 def png(plate: Plate) -> bytes:
@@ -194,3 +187,58 @@ def _saved(figure: Figure, **form: Any) -> bytes:
     with style():
         figure.savefig(content, **form)
     return content.getvalue()
+
+
+@dataclass(frozen=True, eq=False)
+class Plate:
+    """A figure to be shown.
+
+    Parameters
+    ----------
+    figure : Figure or None
+        None if it could not be drawn; the caption then says why.
+    name : str
+        Stem of its file.
+    caption : str
+        What it shows, in words and numbers.
+    heading : str
+        What it is, in a few words.
+    """
+
+    figure: Figure | None
+    name: str
+    caption: str
+    heading: str = ""
+
+
+def draw_all(drawings: Mapping[str, Callable[[], Plate | None]]) -> list[Plate]:
+    """Draw figures by name, in order; one that fails has no figure and a caption saying why."""
+    with style():
+        drawn = [_attempt(name, draw) for name, draw in drawings.items()]
+    return [plate for plate in drawn if plate is not None]
+
+
+def mark(figure: Figure, label: str) -> None:
+    """Write in a strip below a figure what its data are, if they have a label."""
+    if label:
+        below = -0.02 / figure.get_figheight()
+        text = f"{label.capitalize()} data"
+        figure.text(0.995, below, text, ha="right", va="top", fontsize=7, color="0.35")
+
+
+def marked(plates: Sequence[Plate], label: str) -> list[Plate]:
+    """Return plates that say what their data are, in the figure and below it."""
+    for plate in plates:
+        if plate.figure is not None:
+            mark(plate.figure, label)
+    said = f" {label.capitalize()} data." if label else ""
+    return [replace(plate, caption=f"{plate.caption}{said}") for plate in plates]
+
+
+def _attempt(name: str, draw: Callable[[], Plate | None]) -> Plate | None:
+    try:
+        return draw()
+    except Exception as error:
+        # Any failure: a page without one figure is worth more than no page.
+        why = f"{type(error).__name__}: {error}"
+        return Plate(None, name, f"This figure could not be drawn ({why}).")

@@ -5,17 +5,19 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from calib.gap.constants import LEFT, MIN_EFFECT_SIZE, MIN_EFFECT_SIZE_IN_PAIR, MOST_LEFT
 from calib.gap.document import Explanation, GapDocument
 from calib.gap.files import program_files
-from calib.report.figures.plate import Plate
 from calib.report.gap_verdict import Tone, tied
 from calib.report.gap_words import Words, short_name
 from calib.report.labels import units_of
 from calib.report.markup import prose
 from calib.report.page.template import equation, parametrisation, picture, template
+
+if TYPE_CHECKING:
+    from calib.report.figures.style import Plate
 
 # A shape beside every colour.
 TONE_MARKS = {

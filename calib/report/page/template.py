@@ -7,14 +7,13 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from pathlib import PurePosixPath
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 from calib.data.reader import said_of
 from calib.models.card import mathml
-from calib.report.figures.plate import Plate
 from calib.report.labels import (
     MINUS,
     joined,
@@ -29,6 +28,9 @@ from calib.report.numbers import (
     format_number,
     format_value,
 )
+
+if TYPE_CHECKING:
+    from calib.report.figures.style import Plate
 
 _HERE = "calib.report.page"
 

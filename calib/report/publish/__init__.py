@@ -6,6 +6,8 @@ byte, wherever these are the same.
 
 from __future__ import annotations
 
+import csv
+import io
 import re
 import shlex
 import textwrap
@@ -22,14 +24,12 @@ from calib.report.labels import joined
 from calib.report.markup import bibliography, bibtex, cited, to_latex, to_text
 from calib.report.numbers import format_number, format_value
 from calib.report.page.template import template, words
-from calib.report.publish.tables import Table, csv_tables, latex_tables, write_csv
+from calib.report.publish.tables import TOPICS, Row, Table
 
 type Paragraph = tuple[str, tuple[str, ...]]
 """A heading, empty for the first, and sentences with marks (`calib.report.markup`)."""
 
-_NORMAL: Mapping[str, Any] = {
-    "family": "", "correlated_along": "", "depends_on": None, "against_normal": None,
-}  # fmt: skip
+_NORMAL = dict.fromkeys(("family", "correlated_along", "depends_on", "against_normal"))
 
 
 @dataclass(frozen=True)
@@ -65,15 +65,21 @@ def publication(manifest: Mapping[str, Any], summary: Mapping[str, Any]) -> Publ
     version = str(manifest["versions"]["terracalib"])
     paragraphs = methods(manifest, found)
     label = ", ".join(dict.fromkeys(o.label for o in found if o.label))
-    by_topic = {
-        topic: [_labelled(t, label) for t in tables]
-        for topic, tables in latex_tables(found, manifest["settings"]["gate"]).items()
-    }
+    gate = manifest["settings"]["gate"]
+    by_topic = {}
+    for topic, of in TOPICS.items():
+        made = [table for o in found for table in of.of_output(o)]
+        made += [of.together(found, gate)] if of.together else []
+        by_topic[topic] = [_labelled(table, label) for table in made]
     tables = [t for some in by_topic.values() for t in some]
     said = [sentence for _, sentences in paragraphs for sentence in sentences]
     references = bibliography(cited(said), version)
     texts = [(heading, " ".join(map(to_text, sentences))) for heading, sentences in paragraphs]
-    files = {f"tables/{name}.csv": write_csv(t) for name, t in csv_tables(found).items() if t}
+    files = {
+        f"tables/{name}.csv": _csv(rows)
+        for name, topic in TOPICS.items()
+        if (rows := [{**_whose(o, label), **row} for o in found for row in topic.rows(o)])
+    }
     links = tuple(
         (topic.capitalize(), path, tuple(f"tables/{t.label}.tex" for t in some))
         for topic, some in by_topic.items()
@@ -84,6 +90,20 @@ def publication(manifest: Mapping[str, Any], summary: Mapping[str, Any]) -> Publ
     files["methods.tex"] = _tex(paragraphs)
     files["references.bib"] = bibtex(cited([*said, *(t.caption for t in tables)]), version)
     return Publication(files, links, tuple(texts), tuple(references))
+
+
+def _whose(o: Output, label: str) -> dict[str, str]:
+    """Return the first cells of a row for programs; what data are called, if any are labelled."""
+    return {"output": o.key, **({"data_label": o.label} if label else {}), "model": o.model.name}
+
+
+def _csv(rows: Sequence[Row]) -> str:
+    """Return rows for programs as CSV (RFC 4180, but for line ends); numbers are in ASCII."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, rows[0], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
 
 
 def _labelled(table: Table, label: str) -> Table:
@@ -98,13 +118,18 @@ def methods(manifest: Mapping[str, Any], found: Sequence[Output]) -> list[Paragr
     labels = sorted({o.label for o in found if o.label})
     try:
         text = template("methods.j2", __name__, html=False).render(
-            v=manifest["versions"], s=manifest["settings"], ga=manifest["genetic_algorithm"],
-            seed=manifest["seed"], command=shlex.join(map(str, manifest["command"])),
-            labels=[label for label in labels if label in KNOWN_DATA], known=KNOWN_DATA,
+            v=manifest["versions"],
+            s=manifest["settings"],
+            ga=manifest["genetic_algorithm"],
+            seed=manifest["seed"],
+            command=shlex.join(map(str, manifest["command"])),
+            labels=[label for label in labels if label in KNOWN_DATA],
+            known=KNOWN_DATA,
             genetic=any("genetic" in o.found["estimates"] for o in found),
             digits=12,  # of a hash, which tell two files apart; the manifest has all of them
-            outputs=[(o, _words(o)) for o in found], format_value=format_value,
-        )  # fmt: skip
+            outputs=[(o, _words(o)) for o in found],
+            format_value=format_value,
+        )
     except UndefinedError as error:
         raise KeyError(str(error)) from None
     blocks = [

@@ -6,8 +6,6 @@ both in `TOPICS`. Cells, heads and captions are text with marks (`calib.report.m
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,6 +16,7 @@ from calib.report.document import Output
 from calib.report.markup import to_latex, with_symbols
 from calib.report.numbers import (
     NOTHING,
+    TIMES,
     ascii_number,
     ascii_text,
     centre_place,
@@ -31,6 +30,7 @@ from calib.report.numbers import (
     last_place,
     skewed,
 )
+from calib.report.page.template import words
 from calib.report.reference import Figure
 from calib.validation.scores import MOVED, PRIOR
 
@@ -79,24 +79,28 @@ class Table:
             return f"    {' & '.join([first, *(ragged + c for c in others)])} \\tabularnewline"
 
         groups = ["\n".join(line(row.values()) for row in group) for group in self.groups if group]
-        return "\n".join([
-            "% Needs \\usepackage{booktabs}; the references cited are in references.bib.",
-            "\\begin{table}", "  \\centering", "  \\footnotesize",
-            f"  \\caption{{{to_latex(self.caption)}}}",
-            f"  \\label{{tab:{self.label.replace('_', '-')}}}",
-            f"  \\begin{{tabular}}{{{self.columns}}}", "    \\toprule", line(self.head),
-            "    \\midrule", "\n    \\midrule\n".join(groups), "    \\bottomrule",
-            "  \\end{tabular}", "\\end{table}", "",
-        ])  # fmt: skip
+        return "\n".join(
+            [
+                "% Needs \\usepackage{booktabs}; the references cited are in references.bib.",
+                "\\begin{table}",
+                "  \\centering",
+                "  \\footnotesize",
+                f"  \\caption{{{to_latex(self.caption)}}}",
+                f"  \\label{{tab:{self.label.replace('_', '-')}}}",
+                f"  \\begin{{tabular}}{{{self.columns}}}",
+                "    \\toprule",
+                line(self.head),
+                "    \\midrule",
+                "\n    \\midrule\n".join(groups),
+                "    \\bottomrule",
+                "  \\end{tabular}",
+                "\\end{table}\n",
+            ]
+        )
 
 
-def write_csv(rows: Sequence[Row]) -> str:
-    """Return rows for programs as CSV (RFC 4180, but for line ends); numbers are in ASCII."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, rows[0], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
+def _caption(table: str, **facts: object) -> str:
+    return words("captions.j2", "calib.report.publish", table=table, **facts)
 
 
 def _named(name: str, unit: str) -> str:
@@ -124,31 +128,25 @@ def posterior_table(o: Output) -> Table:
     """
     derived = [s for s in o.posterior if s.sd_ratio != s.sd_ratio]
     sampled = [s for s in o.posterior if s.sd_ratio == s.sd_ratio]
-    below = " The parameters above the rule follow from the sampled ones below it."
-    return Table(
-        f"posterior_{o.key}",
-        f"{'' if o.converged else 'NOT CONVERGED, not to be used. '}Posterior of the parameters of "
-        f"{o.model_words} from {o.found['data']['n']} rows of {o.data_words}: mean ± standard "
-        "deviation (sd), or the median where that would mislead; 95 % "
-        "highest-density interval (HDI); effective sample sizes (ESS), R-hat [@Vehtari_2021], and "
-        f"the sd over that of the prior.{below if derived else ''}",
-        "lrrrrrr",
-        [
-            [_posterior_row(s, o.facts.get("roles", {})) for s in group]
-            for group in (derived, sampled)
-        ],
-    )
+    roles = o.facts.get("roles", {})
+    groups = [[_posterior_row(s, roles) for s in group] for group in (derived, sampled)]
+    said = _caption("posterior", o=o, derived=derived)
+    return Table(f"posterior_{o.key}", said, "lrrrrrr", groups)
 
 
 def _posterior_row(s: ParameterSummary, roles: Mapping[str, str]) -> Row:
     role = roles.get(s.name, "") or "follows from the others"
     set_by = f"[!{role}]" if role in (PRIOR, MOVED) else role
     return {
-        "Parameter": _named(s.name, s.unit), "Posterior": centre_text(s),
-        "95 % HDI": interval_text(s), "ESS bulk": f"{s.ess_bulk:.0f}",
-        "ESS tail": f"{s.ess_tail:.0f}", "R-hat": f"{s.rhat:.3f}",
-        "sd/prior sd": format_number(s.sd_ratio, 2), **({"Set by": set_by} if roles else {}),
-    }  # fmt: skip
+        "Parameter": _named(s.name, s.unit),
+        "Posterior": centre_text(s),
+        "95 % HDI": interval_text(s),
+        "ESS bulk": f"{s.ess_bulk:.0f}",
+        "ESS tail": f"{s.ess_tail:.0f}",
+        "R-hat": f"{s.rhat:.3f}",
+        "sd/prior sd": format_number(s.sd_ratio, 2),
+        **({"Set by": set_by} if roles else {}),
+    }
 
 
 def posterior_rows(o: Output) -> Iterator[Row]:
@@ -156,17 +154,20 @@ def posterior_rows(o: Output) -> Iterator[Row]:
     for s in o.posterior:
         last, (low, high) = last_place(s.sd, s.mcse_mean), end_places(s)
         yield {
-            "parameter": s.name, "unit": s.unit,
-            "mean": ascii_number(s.mean, last), "sd": ascii_number(s.sd, last),
+            "parameter": s.name,
+            "unit": s.unit,
+            "mean": ascii_number(s.mean, last),
+            "sd": ascii_number(s.sd, last),
             "mcse_mean": ascii_text(format_number(s.mcse_mean, 2)),
             "median": ascii_number(s.median, centre_place(s)),
             "hdi95_lower": ascii_number(s.hdi_lower, low),
             "hdi95_upper": ascii_number(s.hdi_upper, high),
-            "ess_bulk": f"{s.ess_bulk:.0f}", "ess_tail": f"{s.ess_tail:.0f}",
+            "ess_bulk": f"{s.ess_bulk:.0f}",
+            "ess_tail": f"{s.ess_tail:.0f}",
             "rhat": f"{s.rhat:.4f}",
             "posterior_sd_over_prior_sd": ascii_text(format_number(s.sd_ratio, 2)),
             "converged": "yes" if o.converged else "no",
-        }  # fmt: skip
+        }
 
 
 def sensitivity_rows(o: Output) -> Iterator[Row]:
@@ -184,31 +185,23 @@ def sensitivity_rows(o: Output) -> Iterator[Row]:
 
 def sensitivity_table(o: Output) -> Table | None:
     """Return what each parameter owes to the prior and to the data; None if that is not known."""
-    found, limits = o.found["prior_sensitivity"]["parameters"], o.found["prior_sensitivity"]
+    known = o.found["prior_sensitivity"]
+    found = known["parameters"]
     if not found:
         return None
-    criteria = limits["criteria"]
-    unknown = ", ".join(f"[${name}]" for name, s in found.items() if not s["identified"])
-    said = f"Not identified by these data: {unknown}." if unknown else (
-        "Every parameter is identified by these data."
-    )  # fmt: skip
-    return Table(
-        f"sensitivity_{o.key}",
-        f"{said} A parameter is not identified if its contraction, 1 \N{MINUS SIGN} (posterior "
-        f"variance)/(prior variance), is below {criteria['contraction_at_least']:g}, or if it "
-        f"reacts to the prior (at least {criteria['power_scaling_threshold']:g}) and not to the "
-        "data (less). Reacts to: how far its posterior moves per doubling of the power of the "
-        "prior, or of the likelihood (cumulative Jensen-Shannon distance; Kallioinen et al. 2024, "
-        "doi:10.1007/s11222-023-10366-5).",
-        "lrrrl",
-        [[
-            {"Parameter": f"[${name}]", "Contraction": _number(s["contraction"], 2),
-             "Reacts to prior": _number(s["prior"], 2),
-             "Reacts to data": _number(s["likelihood"], 2),
-             "Identified by": s["reading"] if s["identified"] else f"[!{s['reading']}]"}
-            for name, s in found.items()
-        ]],
-    )  # fmt: skip
+    unknown = [f"[${name}]" for name, s in found.items() if not s["identified"]]
+    rows = [
+        {
+            "Parameter": f"[${name}]",
+            "Contraction": _number(s["contraction"], 2),
+            "Reacts to prior": _number(s["prior"], 2),
+            "Reacts to data": _number(s["likelihood"], 2),
+            "Identified by": s["reading"] if s["identified"] else f"[!{s['reading']}]",
+        }
+        for name, s in found.items()
+    ]
+    said = _caption("sensitivity", unknown=unknown, criteria=known["criteria"])
+    return Table(f"sensitivity_{o.key}", said, "lrrrl", [rows])
 
 
 # Point estimates
@@ -273,44 +266,38 @@ def estimates_table(o: Output) -> Table | None:
         if table:
             row[source] = format_like(printed.value, printed.text) if printed else NOTHING
         row[short[method]] = _ticked(value, printed)
-    for name, text in (
-        ("Evaluations", {m: f"{fit[m]['evaluations']:,}" for m in methods}),
-        ("Stopped by its own rule", {m: _yes(fit[m]["converged"]) for m in methods}),
+    for name, of_fit in (
+        ("Evaluations", lambda found: f"{found['evaluations']:,}"),
+        ("Stopped by its own rule", lambda found: _yes(found["converged"])),
     ):
         beside = {table.source: NOTHING} if table else {}
-        rows[name] = {"Parameter": name, **beside, **{short[m]: t for m, t in text.items()}}
+        rows[name] = {"Parameter": name, **beside, **{short[m]: of_fit(fit[m]) for m in methods}}
     posterior = {s.name: s for s in o.posterior}
     for name, row in rows.items():
-        s = posterior.get(name)
-        row["Posterior"] = NOTHING if s is None else centre_text(s) + (
-            f" ({interval_text(s)})" if skewed(s) else ""
-        )  # fmt: skip
-    said = [f"{short[m]}: {METHODS[m].title}" for m in methods if m in METHODS]
-    notes = [f"{method_name(m).capitalize()}: {fit[m]['note']}." for m in methods if fit[m]["note"]]
-    data, all_rows = o.found["data"], "all " if o.estimates_use_all_rows else ""
-    caption = [
-        f"Point estimates of the parameters of {o.model_words} from {all_rows}{o.n_estimated} rows "
-        f"of {o.data_words}{f', beside its {table.source}' if table else ''}, and the posterior "
-        f"from {data['n']} rows (mean ± standard deviation, or median and 95 % highest-density "
-        "interval).",
-        f"{'; '.join(said)}." if said else "",
-        f"A {TICK} marks what equals the source in every printed digit." if table else "",
-        *notes,
-        f"{table.source}: {table.note}." if table and table.note else "",
-    ]
+        row["Posterior"] = NOTHING
+        if name in posterior:
+            s = posterior[name]
+            row["Posterior"] = centre_text(s) + (f" ({interval_text(s)})" if skewed(s) else "")
+    said = _caption(
+        "estimates",
+        o=o,
+        printed=table,
+        tick=TICK,
+        titles=[f"{short[m]}: {METHODS[m].title}" for m in methods if m in METHODS],
+        notes=[
+            f"{method_name(m).capitalize()}: {fit[m]['note']}" for m in methods if fit[m]["note"]
+        ],
+    )
     parameters = [row for name, row in rows.items() if name in posterior]
-    return Table(
-        f"estimates_{o.key}", " ".join(filter(None, caption)).replace("..", "."),
-        f"l{'r' * (len(methods) + 1 + bool(table))}",
-        [parameters, [row for row in rows.values() if row not in parameters]],
-    )  # fmt: skip
+    others = [row for row in rows.values() if row not in parameters]
+    columns = f"l{'r' * (len(methods) + 1 + bool(table))}"
+    return Table(f"estimates_{o.key}", said.replace("..", "."), columns, [parameters, others])
 
 
 def pressure_table(o: Output) -> Table | None:
     """Return the Magic Formula at each pressure alone; None for other models."""
     groups: dict[str, list[Row]] = {}
-    names = [("Sum of squares" if k == "cost" else f"[${k}]") + (f" ([u:{u}])" if u != "1" else "")
-             for k, u in _ALONE.items()]  # fmt: skip
+    names = [_named(k, u).replace("[$cost]", _QUALITY["cost"]) for k, u in _ALONE.items()]
 
     def add(pressure: str, method: str, cells: Iterable[str]) -> None:
         row = {"Pressure": pressure, "Method": method} | dict(zip(names, cells, strict=True))
@@ -321,21 +308,13 @@ def pressure_table(o: Output) -> Table | None:
     for pressure in groups:
         for tables in o.reference.alone.values():
             if (table := tables.get(round(_psi(pressure)))) is not None:
-                printed = (table.figures[k] for k in _ALONE)
-                add(pressure, f"published ({table.place})",
-                    (format_like(figure.value, figure.text) for figure in printed))  # fmt: skip
+                printed = [table.figures[k] for k in _ALONE]
+                cells = (format_like(figure.value, figure.text) for figure in printed)
+                add(pressure, f"published ({table.place})", cells)
     if not groups:
         return None
-    marks = (
-        f" A {TICK} marks what equals the source's table of that method (least squares and "
-        "differential evolution: of the genetic algorithm) in every printed digit."
-    )
-    return Table(
-        f"estimates_by_pressure_{o.key}",
-        "The Magic Formula (Eqs 3\N{EN DASH}5 of the source [@He_2019]) at each inflation pressure "
-        f"alone, {o.data_words}.{marks if o.label else ''}",
-        "llrrrrr", list(groups.values()),
-    )  # fmt: skip
+    said = _caption("by_pressure", o=o, tick=TICK)
+    return Table(f"estimates_by_pressure_{o.key}", said, "llrrrrr", list(groups.values()))
 
 
 def estimates_rows(o: Output) -> Iterator[Row]:
@@ -343,16 +322,19 @@ def estimates_rows(o: Output) -> Iterator[Row]:
     found = [(o.model.name, "together", str(o.n_estimated), e) for e in _together(o)]
     found += [("magic_formula", at, "", e) for at, _, estimates in _alone(o) for e in estimates]
     for model, at, n, (name, unit, method, value, printed, source) in found:
-        same = printed is not None and value is not None
+        agrees = _yes(printed.agrees(value)).lower() if printed and value is not None else ""
         yield {
-            "model": model, "rows": at, "n_rows": n, "quantity": name, "unit": unit,
-            "method": method, "value": ascii_text(_digits(value, printed)),
-            "published": printed.text if printed and same else "",
-            "published_in": source if same else "",
-            "same_printed_digits": ""
-            if printed is None or value is None
-            else _yes(printed.agrees(value)).lower(),
-        }  # fmt: skip
+            "model": model,
+            "rows": at,
+            "n_rows": n,
+            "quantity": name,
+            "unit": unit,
+            "method": method,
+            "value": ascii_text(_digits(value, printed)),
+            "published": printed.text if printed and agrees else "",
+            "published_in": source if agrees else "",
+            "same_printed_digits": agrees,
+        }
 
 
 # Scores on rows that were not fitted
@@ -367,29 +349,21 @@ def _errors(o: Output) -> list[str]:
 
 def validation_table(found: Sequence[Output], gate: Mapping[str, float]) -> Table:
     """Return the scores of every output."""
-    labels = sorted({o.label for o in found if o.label})
     rows = []
     for o in found:
         v = o.found["validation"]
         elpd = v.get("elpd")
-        rows.append({
+        row = {
             "Output": f"{o.name} ({o.axis().unit})",
             "Rows": f"held out: {o.held_out}" if o.held_out else "leave-one-out",
             "n": str(v["n"]),
             **dict(zip(("RMSE", "CRPS", "Error (%)"), _errors(o), strict=True)),
             **{f"in {level} %": str(o.hits(level)) for level in _LEVELS},
             "elpd": NOTHING if elpd is None else format_value(elpd, v["elpd_se"] or 0.0),
-        })  # fmt: skip
-    return Table(
-        "validation",
-        f"Predictions of rows that were not fitted{f' ({", ".join(labels)} data)' * bool(labels)}: "
-        "number of rows n, root mean square error of the predictive median (RMSE), mean continuous "
-        "ranked probability score (CRPS), largest relative error, rows in the central 50, 90 and "
-        "95 % predictive bands, and expected log predictive density (elpd) of leave-one-out "
-        "[@Vehtari_2017]. RMSE and CRPS in the unit of the output.",
-        "llrrrrrrrr",
-        [rows],
-    )
+        }
+        rows.append(row)
+    said = _caption("validation", labels=sorted({o.label for o in found if o.label}))
+    return Table("validation", said, "llrrrrrrrr", [rows])
 
 
 def validation_rows(o: Output) -> Iterator[Row]:
@@ -398,9 +372,15 @@ def validation_rows(o: Output) -> Iterator[Row]:
     rmse, crps, worst = map(ascii_text, _errors(o))
     above = "n_relative_error_above_6_percent"
     cells = {
-        "method": v["method"], "held_out": o.held_out, "n": str(v["n"]), "unit": o.axis().unit,
-        "rmse": rmse, "crps": crps, "max_relative_error_percent": worst, above: str(v[above]),
-    }  # fmt: skip
+        "method": v["method"],
+        "held_out": o.held_out,
+        "n": str(v["n"]),
+        "unit": o.axis().unit,
+        "rmse": rmse,
+        "crps": crps,
+        "max_relative_error_percent": worst,
+        above: str(v[above]),
+    }
     for level in _LEVELS:
         cells[f"covered_{level}"] = str(o.hits(level))
         low, high, *_ = v["coverage_interval"][level]
@@ -435,22 +415,15 @@ def _convergence(o: Output) -> dict[str, str]:
 
 def convergence_table(found: Sequence[Output], gate: Mapping[str, float]) -> Table:
     """Return what the convergence gate saw, with its limits as in the manifest."""
-    heads = ("Ensembles", "Walkers", "Steps", "R-hat", "ESS bulk", "ESS tail",
-             "Steps/\N{GREEK SMALL LETTER TAU}", "Accepted (%)", "Evaluations")  # fmt: skip
-    return Table(
-        "convergence",
-        "Convergence of the posteriors: independently seeded ensembles, walkers in each, kept "
-        f"steps, largest rank-normalised R-hat [@Vehtari_2021] (at most {gate['rhat_max']:g} "
-        "passes), smallest bulk and tail effective sample size (at least "
-        f"{gate['ess_min']:g}), smallest length in autocorrelation times (at least "
-        f"{gate['taus_min']:g}), accepted proposals, evaluations of the density.",
-        "lrrrrrrrrrl",
-        [[
-            {"Output": o.name, **dict(zip(heads, _convergence(o).values(), strict=True)),
-             "Passed": _yes(o.converged)}
-            for o in found
-        ]],
-    )  # fmt: skip
+    heads = ("Ensembles", "Walkers", "Steps", "R-hat", "ESS bulk", "ESS tail", "Steps/τ")
+    heads += ("Accepted (%)", "Evaluations")
+    rows = [
+        {"Output": o.name}
+        | dict(zip(heads, _convergence(o).values(), strict=True))
+        | {"Passed": _yes(o.converged)}
+        for o in found
+    ]
+    return Table("convergence", _caption("convergence", gate=gate), "lrrrrrrrrrl", [rows])
 
 
 def convergence_rows(o: Output) -> Iterator[Row]:
@@ -465,20 +438,17 @@ def convergence_rows(o: Output) -> Iterator[Row]:
 
 def priors_table(o: Output) -> Table:
     """Return the priors of an output."""
-    file, priors = o.task["priors"], o.found["priors"]
-    return Table(
-        f"priors_{o.key}",
-        f"Priors of the parameters of {o.model_words}, from `{file['source']}` (SHA-256 "
-        f"`{file['sha256'][:12]}`): normal(mean, sd), lognormal(median, sd of the logarithm), "
-        "on [lower, upper] where truncated.",
-        r"lp{0.2\textwidth}p{0.36\textwidth}p{0.24\textwidth}",
-        [[
-            {"Parameter": _named(name, p["unit"]),
-             "Distribution": p["distribution"].replace(" x ", " \N{MULTIPLICATION SIGN} "),
-             **{k.capitalize(): with_symbols(p[k], priors) for k in ("reason", "source")}}
-            for name, p in priors.items()
-        ]],
-    )  # fmt: skip
+    priors = o.found["priors"]
+    rows = [
+        {
+            "Parameter": _named(name, p["unit"]),
+            "Distribution": p["distribution"].replace(" x ", f" {TIMES} "),
+            **{k.capitalize(): with_symbols(p[k], priors) for k in ("reason", "source")},
+        }
+        for name, p in priors.items()
+    ]
+    columns = r"lp{0.2\textwidth}p{0.36\textwidth}p{0.24\textwidth}"
+    return Table(f"priors_{o.key}", _caption("priors", o=o, file=o.task["priors"]), columns, [rows])
 
 
 def priors_rows(o: Output) -> Iterator[Row]:
@@ -490,16 +460,10 @@ def priors_rows(o: Output) -> Iterator[Row]:
 
 @dataclass(frozen=True)
 class Topic:
-    """A subject of tables, on the page, for LaTeX and for programs.
+    """A subject of tables: rows of an output for programs, and what people read.
 
-    Parameters
-    ----------
-    rows : callable
-        The rows of an output for programs.
-    each : tuple of callable
-        Tables of one output for people, None where it has none; the page shows them with it.
-    together : callable, optional
-        The table of all outputs for people, given the limits of the gate.
+    That is tables of one output, None where it has none, and one of all outputs, given the limits
+    of the gate.
     """
 
     rows: Callable[[Output], Iterator[Row]]
@@ -520,30 +484,3 @@ TOPICS: Mapping[str, Topic] = {
     "priors": Topic(priors_rows, (priors_table,)),
 }
 """All tables. One whose place the page's template does not name stands at the end of its output."""
-
-
-def csv_tables(found: Sequence[Output]) -> dict[str, list[Row]]:
-    """Return the rows of every topic for programs; what reconstructed data are called, if any."""
-    labelled = any(o.label for o in found)
-    return {
-        name: [
-            {
-                "output": o.key,
-                **({"data_label": o.label} if labelled else {}),
-                "model": o.model.name,
-                **row,
-            }
-            for o in found
-            for row in topic.rows(o)
-        ]
-        for name, topic in TOPICS.items()
-    }
-
-
-def latex_tables(found: Sequence[Output], gate: Mapping[str, float]) -> dict[str, list[Table]]:
-    """Return the tables for people by topic: of each output, and of all together."""
-    return {
-        name: [table for o in found for table in topic.of_output(o)]
-        + ([topic.together(found, gate)] if topic.together else [])
-        for name, topic in TOPICS.items()
-    }

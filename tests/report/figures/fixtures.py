@@ -12,8 +12,7 @@ from calib.he2019.published import HE2019
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.problem import build_problem
 from calib.report.figures.collect import plates
-from calib.report.figures.plate import Plate
-from calib.report.figures.style import style
+from calib.report.figures.style import Plate, style
 from calib.report.reference import NOTHING
 from calib.report.study import OutputResult
 from tests.report.figures.results import build

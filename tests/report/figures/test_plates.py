@@ -12,11 +12,10 @@ from calib.data import table_from_arrays
 from calib.data.quantities import QUANTITIES
 from calib.he2019.published import HE2019
 from calib.report.figures.bands import bands_plate, density_plate, prior_predictive_plate
-from calib.report.figures.plate import Plate, draw_all
 from calib.report.figures.posterior import (
     ensembles_plate,
 )
-from calib.report.figures.style import style
+from calib.report.figures.style import Plate, draw_all, style
 from calib.report.figures.validation import residuals_plate, validation_plate
 from calib.report.labels import axis_of, units_of
 from calib.report.rows import groups, signs_along

@@ -18,7 +18,6 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from calib.report.figures.bands import FILLS
-from calib.report.figures.plate import Plate
 from calib.report.figures.style import (
     CYCLE,
     DASHES,
@@ -27,6 +26,7 @@ from calib.report.figures.style import (
     MIDDLE_MM,
     SINGLE_MM,
     SMALLEST_PT,
+    Plate,
     pdf_bytes,
     png_bytes,
     style,

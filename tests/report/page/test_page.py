@@ -14,7 +14,7 @@ from calib.data import read_table
 from calib.models import MODELS, example_csv
 from calib.report.document import Output
 from calib.report.figures.collect import Drawn
-from calib.report.figures.plate import Plate
+from calib.report.figures.style import Plate
 from calib.report.page.content import render_page
 from calib.report.page.template import equation, parametrisation
 from calib.report.publish.tables import TICK, TOPICS, Table
