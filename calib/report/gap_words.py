@@ -1,11 +1,15 @@
-"""Words about a diagnosis: its template's sentences, and how quantities in them are written."""
+"""The verdict on a gap, by ten rules, and the words about a diagnosis.
+
+The sentences are those of ``diagnosis_words.j2``; `Notation` writes the quantities in them.
+"""
 
 from __future__ import annotations
 
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from itertools import count
+from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
@@ -16,11 +20,10 @@ from calib.gap.case import words_of
 from calib.gap.constants import ALIKE
 from calib.gap.describe import gap_document
 from calib.gap.diagnose import Diagnosis
-from calib.gap.document import BENCH, Cause, Explanation, GapDocument, Next, Size
+from calib.gap.document import BENCH, Cause, Explanation, GapDocument, Next, RunTrend, Size
 from calib.gap.effects.dependence import PREFIX
 from calib.gap.effects.instruments import EARLY
 from calib.gap.mixture import Region
-from calib.report.gap_verdict import SURE, GapVerdict, judge, rivals, tied
 from calib.report.labels import (
     MINUS,
     NO_UNIT,
@@ -35,31 +38,108 @@ from calib.report.labels import (
 from calib.report.numbers import format_value
 from calib.report.page.template import template
 
+# From here on a cause, or no gap, is certain.
+SURE = 0.9
+# Explanations within this factor of the best are a tie with it.
+TIE = 0.2
+
+
+class Tone(StrEnum):
+    """How the card looks."""
+
+    FINE = "fine"
+    CARE = "care"
+    NO = "no"
+
+
+@dataclass(frozen=True)
+class GapVerdict:
+    """What a busy reader needs: a headline of one sentence, and a state of one to three words.
+
+    The facts say which, how large, where, how far, what next; `rule` is the one that decided.
+    """
+
+    tone: Tone
+    rule: str
+    state: str
+    headline: str
+    facts: Sequence[tuple[str, str]]
+
+
+def rivals(runs: RunTrend) -> list[tuple[str, float]]:
+    """Return the forms of a change over the runs that are about as probable as the first."""
+    return [form for form in runs.forms if form[1] >= TIE * runs.forms[0][1]]
+
+
+def tied(d: GapDocument) -> list[Explanation]:
+    """Return the explanations that are about as probable as the first."""
+    return [e for e in d.explanations if e.probability >= TIE * d.best.probability][:4]
+
+
+def _sure(d: GapDocument) -> bool:
+    """Whether no gap is certain or, if there is one, all causes that act."""
+    if d.verdict == "none":
+        return d.best.probability >= SURE
+    return all(c.probability >= SURE for c in d.acting)
+
+
+def _change(d: GapDocument) -> str:
+    """Return the rule for a change over the runs that is more probable than not, if one applies."""
+    if d.runs is None or d.runs.probability < 0.5:
+        return ""
+    # Several outputs, or one reading, change: not as any listed effect does ...
+    if d.runs.together:
+        return "trend"
+    forms = [form for form, _ in rivals(d.runs)]
+    if forms == ["neither"]:
+        return "wander"
+    # ... or in a form that the data do not decide.
+    named = any(c.probability >= SURE for c in d.acting)
+    return "over runs" if len(forms) > 1 and not named else ""
+
+
+# The first rule that applies decides. A fine level needs certainty, and no doubts.
+RULES: tuple[tuple[str, Tone, Callable[[GapDocument], bool]], ...] = (
+    # There is no gap.
+    ("none", Tone.FINE, lambda d: d.verdict == "none" and _sure(d)),
+    ("not shown", Tone.CARE, lambda d: d.verdict == "none"),
+    ("trend", Tone.NO, lambda d: _change(d) == "trend"),
+    ("wander", Tone.NO, lambda d: _change(d) == "wander"),
+    ("over runs", Tone.CARE, lambda d: _change(d) == "over runs"),
+    # There is a gap, and no listed effect explains it, or several explain it about as well.
+    ("unknown", Tone.NO, lambda d: d.verdict == "unknown"),
+    ("tie", Tone.CARE, lambda d: d.verdict == "ambiguous"),
+    # Causes act.
+    ("recalibrate", Tone.FINE, lambda d: [c.name for c in d.acting] == ["parameter_shift"]),
+    ("named", Tone.FINE, _sure),
+    ("likely", Tone.CARE, lambda d: True),
+)
+
+
+def judge(d: GapDocument) -> tuple[Tone, str]:
+    """Apply the rules: return how the card looks, and the name of the rule that decided."""
+    rule, tone = next((rule, tone) for rule, tone, applies in RULES if applies(d))
+    if tone is Tone.FINE and (d.doubts or not _sure(d)):
+        tone = Tone.CARE
+    return tone, rule
+
+
 # What is less probable is not spoken of: as a percentage it is below 5.
 _SHOWN = 0.045
 
-_NAMES = {
-    "none": "none (noise)", "unknown": "unknown effect", "parameter_shift": "parameter shift",
-}  # fmt: skip
 _TITLES = {
     "none": "no gap beyond the noise",
     "unknown": "a real gap that nothing listed explains",
     "parameter_shift": "the same model with other parameter values",
 }
-_FACTS = {
-    "Causes": "causes", "Known beforehand": "known", "Which": "which", "Not tested": "untested",
-    "Assumed": "assumed", "How large": "how_large", "Where": "where", "How far": "how_far",
-}  # fmt: skip
 
 
 def short_name(name: str) -> str:
     """Return an explanation's, a cause's or a parameter's name in words."""
-    if name in _NAMES:
-        return _NAMES[name]
-    return " + ".join(
-        "something unlisted" if part == "unknown" else part.replace("_", " ")
-        for part in name.split("+")
-    )
+    if name in ("none", "unknown"):
+        return "none (noise)" if name == "none" else "unknown effect"
+    parts = (part.replace("_", " ") for part in name.split("+"))
+    return " + ".join("something unlisted" if part == "unknown" else part for part in parts)
 
 
 def chance(p: float) -> str:
@@ -78,15 +158,13 @@ class Notation:
     Use it within `calib.report.labels.units_of` of the document's headers.
     """
 
-    finite = staticmethod(math.isfinite)
-    range = staticmethod(percent_range)
-    name = staticmethod(short_name)
-    chance = staticmethod(chance)
+    finite, range = staticmethod(math.isfinite), staticmethod(percent_range)
+    name, chance = staticmethod(short_name), staticmethod(chance)
+    rivals, tied, physical = staticmethod(rivals), staticmethod(tied), staticmethod(physical_role)
     bench, early_check, alike_from = BENCH, EARLY, f"{ALIKE:g}"
 
     def __init__(self, d: GapDocument) -> None:
         self.d = d
-        self.rivals = rivals
 
     # Quantities, by the name of an output or by a column
 
@@ -115,11 +193,7 @@ class Notation:
         """Write the names of several explanations or causes."""
         return joined([short_name(name) for name in names])
 
-    def is_sinkage(self, output: str) -> bool:
-        """Say whether an output is a depth."""
-        return physical_role(output) == "sinkage"
-
-    def unit_word(self, output: str) -> str:
+    def unit(self, output: str) -> str:
         """Return the canonical unit of an output."""
         return QUANTITIES[OUTPUTS[output]].unit_word
 
@@ -221,19 +295,6 @@ class Notation:
         pairs = (i if isinstance(i, tuple) else (_cause_name(i), i.probability) for i in items)
         return joined([f"{(words or {}).get(name, name)} ({odds_text(p)})" for name, p in pairs])
 
-    def tied(self) -> list[Explanation]:
-        """Return the explanations that are about as probable as the first."""
-        return tied(self.d)
-
-    def listed_causes(self, e: Explanation) -> list[str]:
-        """Return the listed causes of an explanation."""
-        return [name for name in e.name.split("+") if name != "unknown"]
-
-    def unusable(self) -> list[str]:
-        """Return what was put in as suspected or sized, and cannot be tested."""
-        names = dict.fromkeys(self.d.suspected)
-        return [name for name in names if name in self.d.not_testable]
-
     def without(self) -> str:
         """List the causes that act without what was put in."""
         p = self.d.without_context or {}
@@ -247,11 +308,6 @@ class Notation:
         pairs = [pair for pair in self.d.design.alike if best in pair]
         return [short_name(b if a == best else a) for a, b in pairs]
 
-    def missing(self) -> list[str]:
-        """Return what acts in the soil or at the wheel and is not the model's own, in words."""
-        acting = [c for c in self.d.acting if not c.check and c.name != "parameter_shift"]
-        return [short_name(c.name) for c in acting]
-
     def settled(self, causes: Sequence[Cause]) -> list[str]:
         """Return all faults that checks settle, with what was excluded before.
 
@@ -259,10 +315,6 @@ class Notation:
         """
         faults = (fault for c in causes for fault in c.faults)
         return list(dict.fromkeys([*self.d.excluded, *faults]))
-
-    def grouped(self, causes: Sequence[Cause]) -> list[Cause]:
-        """Return the causes whose instrument has several faults."""
-        return [c for c in causes if len(c.faults) > 1]
 
     def measure_first(self) -> bool:
         """Say whether a measurement comes before the use of the explanation."""
@@ -278,18 +330,14 @@ class Notation:
 
     def priors(self) -> list[tuple[str, str, str, int]]:
         """Return kinds of hypotheses: name, least and largest prior probability, how many."""
-        kinds: dict[str, list[float]] = {}
-        for e in sorted(self.d.explanations, key=lambda e: list(_TITLES).index(e.name)
-                        if e.name in _TITLES else len(_TITLES)):  # fmt: skip
+        kinds: dict[str, list[float]] = {name: [] for name in _TITLES}
+        for e in self.d.explanations:
             kinds.setdefault(_kind(e.name), []).append(e.prior)
         return [
             (kind, percent(min(p)), percent(max(p)), 0 if kind in _TITLES else len(p))
             for kind, p in kinds.items()
+            if p
         ]
-
-    def counter(self) -> Callable[[], int]:
-        """Return what numbers the steps of an advice."""
-        return count(1).__next__
 
 
 def _kind(name: str) -> str:
@@ -331,13 +379,19 @@ class Words:
                 yield "Not excluded", self.n.listed(others)
                 yield from self._next()
             return
-        there = {
-            "causes": d.causes, "known": d.put_in, "untested": d.untested, "assumed": d.assumed,
-            "how_large": d.sizes or (d.unlisted and d.verdict != "ambiguous"),
-        }  # fmt: skip
-        for label, name in _FACTS.items():
-            if there.get(name, True):
-                yield label, self(name)
+        sized = d.sizes or (d.unlisted and d.verdict != "ambiguous")
+        for label, macro, there in (
+            ("Causes", "causes", d.causes),
+            ("Known beforehand", "known", d.put_in),
+            ("Which", "which", True),
+            ("Not tested", "untested", d.untested),
+            ("Assumed", "assumed", d.assumed),
+            ("How large", "how_large", sized),
+            ("Where", "where", True),
+            ("How far", "how_far", True),
+        ):
+            if there:
+                yield label, self(macro)
         yield from self._next()
 
     def _next(self) -> Iterator[tuple[str, str]]:
@@ -358,9 +412,8 @@ class Words:
     def terminal(self) -> str:
         """Return what the terminal shows."""
         card = self.verdict()
-        self._card |= {
-            "headline": card.headline, "facts": card.facts, "track_record": self("track_record"),
-        }  # fmt: skip
+        self._card |= {"headline": card.headline, "facts": card.facts}
+        self._card["track_record"] = self("track_record")
         return str(self._said.terminal()).strip("\n")
 
 

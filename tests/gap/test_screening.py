@@ -19,8 +19,7 @@ from calib.gap.effects import EFFECTS
 from calib.gap.files import document
 from calib.gap.plausibility import oddities
 from calib.gap.screening import _possible, check_units, without_far_conditions
-from calib.report.gap_verdict import Tone
-from calib.report.gap_words import gap_verdict
+from calib.report.gap_words import Tone, gap_verdict
 from tests.gap.cases import PULL_ONLY, make_case, table_without, write_case
 
 FEW = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift", "lug_thrust")}

@@ -8,8 +8,7 @@ import pytest
 
 from calib.gap.document import GapDocument, RunTrend, load_document
 from calib.gap.files import contract
-from calib.report.gap_verdict import RULES, Tone, judge
-from calib.report.gap_words import Words, chance, gap_verdict, short_name
+from calib.report.gap_words import RULES, Tone, Words, chance, gap_verdict, judge, short_name
 from calib.report.labels import odds_text
 from tests.report.gap_documents import DOCUMENTS, PULL, RUNS, gap
 

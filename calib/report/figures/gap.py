@@ -38,8 +38,7 @@ from calib.report.figures.style import (
     Plate,
     panels,
 )
-from calib.report.gap_verdict import TIE
-from calib.report.gap_words import Notation, Words, chance, short_name
+from calib.report.gap_words import TIE, Notation, Words, chance, short_name
 from calib.report.labels import MINUS, NO_UNIT, Axis, axis_of, percent_range, short, units_of
 
 _BAND = "#e6e6e6"

@@ -302,9 +302,7 @@ def estimates_plate(result: OutputResult, reference: Reference = NOTHING) -> Pla
                 dot = _dot(ax, float(d), i + float(y), 4.0, _method_look(e.method))
                 handles[method_name(e.method)] = dot
         if np.isfinite(distance[-1]):
-            handles[f"published ({source})"] = _dot(
-                ax, float(distance[-1]), i, ring | {"zorder": 5}
-            )
+            handles[f"published ({source})"] = _dot(ax, float(distance[-1]), i, 5.0, ring)
         names.append(f"ln {symbol(name)}" if log else symbol(name))
     reach = 1.08 * min(_EDGE, reach)
     ax.set_yticks(range(len(names)), names, fontsize=SYMBOL_PT)

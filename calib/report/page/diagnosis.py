@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 from calib.gap.constants import LEFT, MIN_EFFECT_SIZE, MIN_EFFECT_SIZE_IN_PAIR, MOST_LEFT
 from calib.gap.document import Explanation, GapDocument
 from calib.gap.files import program_files
-from calib.report.gap_verdict import Tone, tied
-from calib.report.gap_words import Words, short_name
+from calib.report.gap_words import Tone, Words, short_name, tied
 from calib.report.labels import units_of
 from calib.report.markup import prose
 from calib.report.page.template import equation, parametrisation, picture, template

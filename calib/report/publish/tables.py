@@ -266,12 +266,12 @@ def estimates_table(o: Output) -> Table | None:
         if table:
             row[source] = format_like(printed.value, printed.text) if printed else NOTHING
         row[short[method]] = _ticked(value, printed)
-    for name, of_fit in (
-        ("Evaluations", lambda found: f"{found['evaluations']:,}"),
-        ("Stopped by its own rule", lambda found: _yes(found["converged"])),
-    ):
-        beside = {table.source: NOTHING} if table else {}
-        rows[name] = {"Parameter": name, **beside, **{short[m]: of_fit(fit[m]) for m in methods}}
+    ended = {
+        "Evaluations": {short[m]: f"{fit[m]['evaluations']:,}" for m in methods},
+        "Stopped by its own rule": {short[m]: _yes(fit[m]["converged"]) for m in methods},
+    }
+    beside = {table.source: NOTHING} if table else {}
+    rows |= {name: {"Parameter": name, **beside, **cells} for name, cells in ended.items()}
     posterior = {s.name: s for s in o.posterior}
     for name, row in rows.items():
         row["Posterior"] = NOTHING
@@ -415,8 +415,8 @@ def _convergence(o: Output) -> dict[str, str]:
 
 def convergence_table(found: Sequence[Output], gate: Mapping[str, float]) -> Table:
     """Return what the convergence gate saw, with its limits as in the manifest."""
-    heads = ("Ensembles", "Walkers", "Steps", "R-hat", "ESS bulk", "ESS tail", "Steps/τ")
-    heads += ("Accepted (%)", "Evaluations")
+    heads = ["Ensembles", "Walkers", "Steps", "R-hat", "ESS bulk", "ESS tail", "Steps/τ"]
+    heads += ["Accepted (%)", "Evaluations"]
     rows = [
         {"Output": o.name}
         | dict(zip(heads, _convergence(o).values(), strict=True))

@@ -15,11 +15,11 @@ from calib.models import MODELS, example_csv
 from calib.report.document import Output
 from calib.report.figures.collect import Drawn
 from calib.report.figures.style import Plate
-from calib.report.page.content import render_page
 from calib.report.page.template import equation, parametrisation
 from calib.report.publish.tables import TICK, TOPICS, Table
 from calib.report.sections import EmulatorSection
 from calib.report.study import Failure, Study
+from calib.report.writer import render_page
 from tests.report.conftest import records
 
 PNG = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR\x00\x00\x00\x02\x00\x00\x00\x03\x08\x06\x00\x00\x00rest"
