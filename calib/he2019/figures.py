@@ -21,7 +21,6 @@ from calib.he2019.published import PUBLISHED
 from calib.models.base import Array
 from calib.models.magic_formula import magic_formula
 from calib.models.soil import rut_depth
-from calib.report.figures.gap import output_rows
 from calib.report.figures.style import (
     BLACK,
     BLUE,
@@ -45,6 +44,7 @@ from calib.report.gap_words import chance, short_name
 from calib.report.labels import MINUS, NO_UNIT, axis_of, short
 from calib.report.page.template import words
 from calib.report.reference import FittedTable
+from calib.report.rows import output_rows
 
 
 def _line(ax: Axes, x: Any, y: Any, colour: str, label: str = "", **how: Any) -> None:

@@ -40,7 +40,8 @@ from calib.inference.problem import Problem, build_problem
 from calib.inference.sampler import SamplerSettings
 from calib.models import get_model
 from calib.models.base import Array
-from calib.report.figures.style import BLACK, BLUE, legend_below, mark, panels, png_bytes, style
+from calib.report.figures import style
+from calib.report.figures.style import mark, png_bytes
 from calib.report.labels import aligned, axis_of, units_of
 from calib.report.numbers import finite, format_number
 from calib.report.page.template import data_uri, template
@@ -58,6 +59,7 @@ from calib.validation.comparison import (
     sentence,
 )
 from calib.validation.constants import N_DRAWS, PARETO_K_MAX
+from calib.validation.scores import Scores
 
 
 def comparison_figure(comparison: Comparison) -> Figure:
@@ -66,33 +68,27 @@ def comparison_figure(comparison: Comparison) -> Figure:
     column = _main_condition(comparison)
     x, y = axis_of(column), axis_of(candidates[0].calibration.problem.bound.model.output)
     cols = min(3, len(candidates))
-    rows = -(-len(candidates) // cols)
-    with style():
-        figure, axes = panels(
-            rows, cols, height=58.0, left=15.0, top=9.0, bottom=20.0, gap_x=4.0, gap_y=16.0,
-            sharex=True, sharey=True,
-        )  # fmt: skip
+    margins = {"left": 15.0, "top": 9.0, "bottom": 20.0, "gap_y": 16.0}
+    with style.style():
+        figure, axes = style.panels(
+            -(-len(candidates) // cols), cols, height=58.0, sharex=True, sharey=True, **margins
+        )
+        handles: dict[str, Any] = {}
         for ax, candidate in zip(axes.flat, candidates, strict=False):
-            table = candidate.loo.table
-            place = _spread(x.factor * table[column])
-            low, middle, high = (
-                y.factor * np.quantile(candidate.loo.draws, q, axis=0) for q in (0.05, 0.5, 0.95)
-            )
-            bars = ax.vlines(place, low, high, color=BLUE, alpha=0.35, linewidth=1.6)
-            dash = ax.plot(place, middle, "_", color=BLUE, markersize=4.0)[0]
-            dots = ax.plot(place, y.factor * candidate.loo.observed, ".", color=BLACK,
-                           markersize=3.0)[0]  # fmt: skip
+            loo = candidate.loo
+            place = _spread(x.factor * loo.table[column])
+            low, middle, high = y.factor * np.quantile(loo.draws, [0.05, 0.5, 0.95], axis=0)
+            bars = ax.vlines(place, low, high, color=style.BLUE, alpha=0.35, linewidth=1.6)
+            (dash,) = ax.plot(place, middle, "_", color=style.BLUE)
+            (dots,) = ax.plot(place, y.factor * loo.observed, ".", color=style.BLACK, ms=3.0)
+            handles = {"measured": dots, "median without the row": dash}
+            handles["90 % interval without the row"] = bars
             weight = comparison.weights[candidate.model]
-            ax.set_title(f"{candidate.model}, weight {weight:.2f}")
-            ax.set_xlabel(x.label)
-        for ax in axes.flat[len(candidates) :]:
-            ax.set_visible(False)
+            ax.set(title=f"{candidate.model}, weight {weight:.2f}", xlabel=x.label)
+        style.hide_rest(axes, len(candidates))
         for row in axes:
             row[0].set_ylabel(y.label)
-        legend_below(
-            figure, {"measured": dots, "median without the row": dash,
-                     "90 % interval without the row": bars}, 3,
-        )  # fmt: skip
+        style.legend_below(figure, handles, 3)
     return figure
 
 
@@ -109,10 +105,9 @@ def _spread(x: Array) -> Array:
     room = 0.012 * (np.ptp(x) or 1.0)
     moved = x.copy()
     for value in np.unique(x):
-        same = np.flatnonzero(x == value)
-        moved[same] += (
-            room * (np.arange(same.size) - 0.5 * (same.size - 1)) / max(1, same.size**0.5)
-        )
+        (same,) = np.nonzero(x == value)
+        beside = np.arange(same.size) - 0.5 * (same.size - 1)
+        moved[same] += room * beside / same.size**0.5
     return moved
 
 
@@ -133,13 +128,15 @@ def table(found: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
     rows = []
     for name, m in models.items():
         row = {
-            "Model": name, "Below the best, elpd": shown(m["below_best"]),
+            "Model": name,
+            "Below the best, elpd": shown(m["below_best"]),
             "Standard error": shown(m["below_best_se"]),
             "Stacking weight": f"{m['weight']:.2f}",
             f"RMSE ({axis.unit})": shown(m["rmse"], axis.factor),
             "90 % covers": f"{100 * m['coverage_90']:.0f} %",
-            "Rows fitted again": str(m["refitted_rows"]), "Log evidence": shown(m["log_evidence"]),
-        }  # fmt: skip
+            "Rows fitted again": str(m["refitted_rows"]),
+            "Log evidence": shown(m["log_evidence"]),
+        }
         if found["held_out"] and (held := m.get("held_out")):
             row |= {
                 "held-out elpd": shown(held["elpd"]),
@@ -160,23 +157,20 @@ def text(found: Mapping[str, Any]) -> str:
 def page(found: Mapping[str, Any], image: bytes) -> str:
     """Return the page of a comparison, from the content of `comparison.json` and the figure."""
     head, body = table(found)
-    models = [get_model(name) for name in found["models"]]
     return template("comparison.html.j2").render(
         found=found,
         data_label=found.get("data_label", ""),
         head=head,
         rows=body,
         image=data_uri(image),
-        models=[{"name": m.name, "title": m.title, "equation": m.equation, "source": m.source}
-                for m in models],
+        models=[get_model(name) for name in found["models"]],
         command=shlex.join(found["command"]),
-    )  # fmt: skip
+    )
 
 
 SCHEMA = "calib/comparison/2"
-FILE, PAGE, FIGURE, HELD_OUT = (
-    "comparison.json", "index.html", "figures/bands.png", "held_out.csv"
-)  # fmt: skip
+FILE, PAGE, HELD_OUT = "comparison.json", "index.html", "held_out.csv"
+FIGURE = "figures/bands.png"
 
 
 class _Compared(Entry):
@@ -218,10 +212,9 @@ def document(
     fails = emulator_fails or {}
     candidates = {c.model: c for c in comparison.candidates}
     first = comparison.candidates[0].calibration.problem.table
-    stated = stated_of_rows(
-        {name: c.rows for name, c in candidates.items()}, comparison.weights,
-        [name for name, c in candidates.items() if not c.sound],
-    )  # fmt: skip
+    rows = {name: c.rows for name, c in candidates.items()}
+    unsound = [name for name, c in candidates.items() if not c.sound]
+    stated = stated_of_rows(rows, comparison.weights, unsound)
     return {
         "schema": SCHEMA,
         "seed": comparison.seed,
@@ -274,28 +267,26 @@ def stated_of_rows(
 
 def _model(c: Candidate) -> dict[str, Any]:
     loo = c.loo
-    found: dict[str, Any] = {
+    found = {
         "elpd_se": loo.elpd_se,
         "elpd_rows": c.rows.tolist(),
         "converged": c.calibration.converged,
-        "pareto_k_max": None if loo.pareto_k is None else finite(float(loo.pareto_k.max())),
+        "pareto_k_max": None if loo.pareto_k is None else float(loo.pareto_k.max()),
         "pareto_k_limit": PARETO_K_MAX,
         "refitted_rows": len(loo.refitted),
         "refits_not_converged": len(loo.unconverged),
-        "rmse": loo.scores.rmse,
-        "crps": finite(loo.scores.crps),
-        "coverage_90": loo.scores.coverage[0.9].proportion,
-        "log_evidence": finite(c.calibration.draws.log_evidence),
+        **_scores(loo.scores),
+        "log_evidence": c.calibration.draws.log_evidence,
     }
     if c.held is not None:
-        found["held_out"] = {
-            "rows": c.held.scores.n,
-            "elpd": finite(c.held_elpd),
-            "rmse": c.held.scores.rmse,
-            "crps": finite(c.held.scores.crps),
-            "coverage_90": c.held.scores.coverage[0.9].proportion,
-        }
-    return found
+        scores = c.held.scores
+        found["held_out"] = {"rows": scores.n, "elpd": c.held_elpd, **_scores(scores)}
+    plain: dict[str, Any] = finite(found)
+    return plain
+
+
+def _scores(s: Scores) -> dict[str, Any]:
+    return {"rmse": s.rmse, "crps": s.crps, "coverage_90": s.coverage[0.9].proportion}
 
 
 def write_comparison(
@@ -358,19 +349,21 @@ def load_stack(folder: Path) -> tuple[dict[str, Any], list[tuple[float, Calibrat
 
 
 def recompute_comparison(
-    record: ComparisonRecord, problems: Mapping[str, Problem], folder: Path, out: Path,
-    progress: Progress, workers: int,
-) -> Comparison:  # fmt: skip
+    record: ComparisonRecord,
+    problems: Mapping[str, Problem],
+    folder: Path,
+    out: Path,
+    progress: Progress,
+    workers: int,
+) -> Comparison:
     """Compare the models of a folder again, and write that into an empty one, as in the record."""
     held_out = None
     if record.held_out:
         models = [p.bound.model for p in problems.values()]
         used = sorted({c for m in models for c in (*m.conditions, m.output)})
         held_out = read_for_model(folder / HELD_OUT, used)
-    again = compare_problems(
-        list(problems.values()), record.seed, held_out=held_out, settings=record.settings,
-        progress=progress, workers=workers,
-    )  # fmt: skip
+    how: Any = {"settings": record.settings, "progress": progress, "workers": workers}
+    again = compare_problems(list(problems.values()), record.seed, held_out=held_out, **how)
     # Differences are from the first, which with other draws may not be the best.
     by_name = {c.model: c for c in again.candidates}
     again = replace(again, candidates=tuple(by_name[name] for name in record.models))
@@ -440,10 +433,8 @@ class ComparisonSection(Section[Comparison]):
     def work_out(self, study: Study, pool: Executor, tell: Progress) -> Comparison:
         """Compare them; processes of its own leave rows out."""
         fitted, held = fitted_rows(self.task)
-        return compare(
-            fitted, self.models, study.seed, held_out=held, priors=self.priors,
-            settings=self.settings, progress=tell, workers=self.workers,
-        )  # fmt: skip
+        how: Any = {"settings": self.settings, "progress": tell, "workers": self.workers}
+        return compare(fitted, self.models, study.seed, held_out=held, priors=self.priors, **how)
 
     @property
     def _held_out(self) -> str:

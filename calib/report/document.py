@@ -221,22 +221,12 @@ def _sampling(calibration: Calibration) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Output:
-    """One output that was worked out, as manifest and summary have it.
-
-    Parameters
-    ----------
-    key : str
-        Of `OUTPUTS`.
-    task, found : mapping
-        Its entries in manifest and summary.
-    facts : mapping
-        Those of `page_facts`, where there is a page.
-    """
+    """One output that was worked out, as manifest and summary have it; its key is of `OUTPUTS`."""
 
     key: str
-    task: Mapping[str, Any]
-    found: Mapping[str, Any]
-    facts: Mapping[str, Any] = field(default_factory=dict)
+    task: Mapping[str, Any]  # its entry in the manifest
+    found: Mapping[str, Any]  # its entry in the summary
+    facts: Mapping[str, Any] = field(default_factory=dict)  # of `page_facts`, if there is a page
 
     @property
     def name(self) -> str:

@@ -28,7 +28,6 @@ from calib.report.labels import (
     MINUS,
     NO_UNIT,
     Axis,
-    axis_of,
     joined,
     odds_text,
     percent,
@@ -37,6 +36,7 @@ from calib.report.labels import (
 )
 from calib.report.numbers import format_value
 from calib.report.page.template import template
+from calib.report.rows import output_axis
 
 # From here on a cause, or no gap, is certain.
 SURE = 0.9
@@ -169,13 +169,8 @@ class Notation:
     # Quantities, by the name of an output or by a column
 
     def axis(self, quantity: str) -> Axis:
-        """Return how an output or a column is written: pulls of a small wheel in newtons."""
-        column = OUTPUTS.get(quantity, quantity)
-        axis = axis_of(column)
-        own = [o.measured for o in self.d.outputs if OUTPUTS[o.name] == column]
-        if own and axis.unit == "kN" and np.abs(own[0]).max() < 0.1:
-            return Axis(axis.name, "N", 1000.0)
-        return axis
+        """Return how an output or a column is written."""
+        return output_axis(self.d, quantity)
 
     def _with_unit(self, quantity: str, text: str) -> str:
         unit = self.axis(quantity).unit

@@ -1,15 +1,17 @@
-"""The rows of a result as figures show them: fitted and held-out points, grouped into panels."""
+"""The rows of a result, or of a diagnosis, as figures show them: grouped into panels."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.data.quantities import columns_of, role_of
+from calib.data.quantities import OUTPUTS, columns_of, role_of
 from calib.data.table import Table
+from calib.gap.document import GapDocument
 from calib.inference.calibration import Calibration
 from calib.models.base import Array
 from calib.report.labels import Axis, axis_of
@@ -164,3 +166,96 @@ def grid(result: Result, group: Group) -> dict[str, Array]:
             outside = np.empty(0) if held is None else held[name][group.held_out]
             conditions[name] = np.full(100, np.median(np.append(inside, outside)))
     return conditions
+
+
+# Of a diagnosis
+
+# Half the width of a 90 % interval, in sds.
+Z = 1.64
+
+
+@dataclass(frozen=True)
+class OutputRows:
+    """Field rows of one output on the scale of its axis, arrays of shape (n,).
+
+    The reading, the calibrated simulator before and the corrected one after; the sd of a reading;
+    truth minus simulator, its sd, and the probability that it exceeds the noise.
+    """
+
+    name: str
+    axis: Axis
+    rows: NDArray[np.int64]
+    measured: Array
+    before: Array
+    after: Array
+    noise: Array
+    gap: Array
+    sd: Array
+    probability: Array
+
+    @property
+    def likely(self) -> int:
+        """How many rows probably have a gap."""
+        return int((self.probability > 0.5).sum())
+
+    @property
+    def noise_median(self) -> float:
+        """Median of the noise."""
+        return float(np.median(self.noise))
+
+    @property
+    def largest(self) -> tuple[float, float, float] | None:
+        """The largest gap with its 90 % interval; None where no row shows any."""
+        row = int(np.abs(self.gap).argmax())
+        gap, half = float(self.gap[row]), Z * float(self.sd[row])
+        shows = abs(gap) + half >= 0.02 * self.noise_median
+        return (gap, gap - half, gap + half) if shows else None
+
+
+def output_axis(d: GapDocument, quantity: str) -> Axis:
+    """Return how an output or a column is written: pulls of a small wheel in newtons."""
+    column = OUTPUTS.get(quantity, quantity)
+    axis = axis_of(column)
+    own = [o.measured for o in d.outputs if OUTPUTS[o.name] == column]
+    if own and axis.unit == "kN" and np.abs(own[0]).max() < 0.1:
+        return Axis(axis.name, "N", 1000.0)
+    return axis
+
+
+def output_rows(d: GapDocument) -> list[OutputRows]:
+    """Return the field rows of every output, as they are drawn."""
+    gathered = []
+    for o in d.outputs:
+        axis = output_axis(d, o.name)
+        values = (o.measured, o.before, o.after, o.noise_sd, o.gap, o.gap_sd)
+        scaled = (axis.scale(np.array(v)) for v in values)
+        found = np.array(o.rows), *scaled, np.array(o.probability)
+        gathered.append(OutputRows(o.name, axis, *found))
+    return gathered
+
+
+def column_of(d: GapDocument, *roles: str) -> str | None:
+    """Return the first recorded condition of some physical roles."""
+    return next((c for role in roles for c in columns_of(role) if c in d.conditions), None)
+
+
+def abscissa(d: GapDocument) -> str:
+    """Return the condition along which a diagnosis is drawn."""
+    return column_of(d, "slip", "order") or next(iter(d.conditions))
+
+
+def panel_groups(
+    d: GapDocument, rows: NDArray[np.int64]
+) -> list[tuple[str, NDArray[np.bool_]]]:  # fmt: skip
+    """Split rows by inflation pressure into a few panels: titles and masks."""
+    column = column_of(d, "pressure")
+    pressure = np.array(d.conditions[column]) if column else np.zeros(1)
+    if column is None or np.ptp(pressure) == 0.0:
+        return [("", np.ones(rows.size, dtype=np.bool_))]
+    distinct, axis = np.unique(pressure), axis_of(column)
+    if distinct.size <= 4:
+        return [(f"{axis.value_text(p)} {axis.unit}", pressure[rows] == p) for p in distinct]
+    edges = np.quantile(pressure, [0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0])
+    group = np.searchsorted(edges[1:-1], pressure[rows])
+    titles = [axis.range_text(np.array(ends)) for ends in pairwise(edges)]
+    return [(title, group == k) for k, title in enumerate(titles)]

@@ -8,27 +8,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
 from calib.batch.folders import write_whole
 from calib.models import MODELS
-from calib.report.figures.style import (
-    BLACK,
-    BLUE,
-    CYCLE,
-    DASHES,
-    GREY,
-    MARKERS,
-    SKY,
-    VERMILION,
-    legend_below,
-    note,
-    panels,
-    png_bytes,
-    style,
-)
+from calib.report.figures import style
+from calib.report.figures.style import png_bytes
 from calib.report.labels import MINUS, aligned, short, symbol
 from calib.report.numbers import finite
 from calib.report.page.template import data_uri, template
@@ -53,74 +41,65 @@ def ranks_figure(model: ModelScore, adjusted: Mapping[tuple[str, str], float]) -
     """
     n = len(model.quantities)
     cols = 6 if n > 12 else min(5, n)
-    rows = -(-n // cols)
-    with style():
-        figure, axes = panels(
-            rows, cols, height=22.0, left=17.0, right=4.0, top=6.0, bottom=18.0, gap_x=4.0,
-            gap_y=10.0, sharex=True, sharey=True,
-        )  # fmt: skip
+    margins = {"left": 17.0, "right": 4.0, "bottom": 18.0, "gap_y": 10.0}
+    with style.style():
+        figure, axes = style.panels(
+            -(-n // cols), cols, height=22.0, sharex=True, sharey=True, **margins
+        )
         handles: dict[str, Any] = {}
         for ax, quantity in zip(axes.flat, model.quantities, strict=False):
             handles = _panel(ax, quantity, alarm=adjusted[model.model, quantity.name] < LEVEL)
-        for ax in axes.flat[n:]:
-            ax.set_visible(False)
+        style.hide_rest(axes, n)
         for row in axes:
             row[0].set_ylabel(f"ECDF {MINUS} PIT")
-        height = figure.get_size_inches()[1] * 25.4
         what = "probability integral transform (PIT) of the truth"
-        figure.supxlabel(what, fontsize=8, y=8.0 / height)
-        legend_below(figure, handles, 3)
+        figure.supxlabel(what, fontsize=8, y=8.0 / (figure.get_figheight() * 25.4))
+        style.legend_below(figure, handles, 3)
     return figure
 
 
 def _panel(ax: Axes, quantity: Quantity, *, alarm: bool) -> dict[str, Any]:
     band = ecdf_band(quantity.pit, 0.95)
-    label = "95 % simultaneous band if calibrated"
-    colour = VERMILION if alarm else BLUE
-    handles: dict[str, Any] = {
-        label: ax.fill_between(
-            band.x, band.lower - band.x, band.upper - band.x, step="post", color=SKY, alpha=0.3,
-            lw=0.0,
-        ),
-    }  # fmt: skip
-    (handles["observed"],) = ax.step(band.x, band.ecdf - band.x, where="post", color=colour, lw=1.0)
-    ax.axhline(0.0, color=GREY, lw=0.5)
+    low, high, found = (v - band.x for v in (band.lower, band.upper, band.ecdf))
+    sky: Any = {"color": style.SKY, "alpha": 0.3, "lw": 0.0}
+    expected = ax.fill_between(band.x, low, high, step="post", **sky)
+    colour = style.VERMILION if alarm else style.BLUE
+    (line,) = ax.step(band.x, found, where="post", color=colour, lw=1.0)
+    ax.axhline(0.0, color=style.GREY, lw=0.5)
     ax.set_title(_TITLES.get(quantity.name) or symbol(quantity.name), fontsize=7.0)
-    half = 1.7 * float(max((band.upper - band.x).max(), abs(band.ecdf - band.x).max() / 1.4))
+    half = 1.7 * float(max(high.max(), abs(found).max() / 1.4))
     ax.set_ylim(min(-half, ax.get_ylim()[0]), max(half, ax.get_ylim()[1]))
-    words = f"p = {short(quantity.p)}" + (" !" if alarm else "")
-    note(ax, words, color=VERMILION if alarm else BLACK)
+    text = f"p = {short(quantity.p)}" + (" !" if alarm else "")
+    style.note(ax, text, color=style.VERMILION if alarm else style.BLACK)
     ax.set_xlim(0.0, 1.0)
     ax.set_xticks([0.0, 0.5, 1.0], ["0", "0.5", "1"])
     ax.xaxis.set_tick_params(labelbottom=True)
-    return handles
+    return {"95 % simultaneous band if calibrated": expected, "observed": line}
 
 
 def coverage_figure(score: SbcScore) -> Figure:
     """Draw how often predictive bands covered simulated held-out measurements, by model."""
-    with style():
-        figure, axes = panels(1, 1, height=62.0, width=120.0, left=14.0, bottom=20.0, top=4.0)
+    levels = np.array([c.level for c in score.models[0].coverage])
+    with style.style():
+        figure, axes = style.panels(1, 1, height=62.0, width=120.0, bottom=20.0, top=4.0)
         ax = axes[0, 0]
-        levels = [c.level for c in score.models[0].coverage]
-        handles = {}
+        handles: dict[str, Any] = {}
         for i, model in enumerate(score.models):
-            shift = 0.13 * (i - 0.5 * (len(score.models) - 1))
-            at = [j + shift for j in range(len(levels))]
-            value = [100.0 * c.proportion for c in model.coverage]
-            low = [100.0 * (c.proportion - c.interval[0]) for c in model.coverage]
-            high = [100.0 * (c.interval[1] - c.proportion) for c in model.coverage]
-            handles[model.model] = ax.errorbar(
-                at, value, yerr=[low, high], fmt=MARKERS[i], color=CYCLE[i], ms=3.5,
-                lw=1.0, mfc="white" if i % 2 else CYCLE[i],
-            )  # fmt: skip
+            marker, colour = style.MARKERS[i % 6], style.CYCLE[i % 6]
+            at = np.arange(levels.size) + 0.13 * (i - 0.5 * (len(score.models) - 1))
+            value = 100.0 * np.array([c.proportion for c in model.coverage])
+            ends = 100.0 * np.array([c.interval for c in model.coverage]).T
+            bars = [value - ends[0], ends[1] - value]
+            look: Any = {"color": colour, "mfc": "white" if i % 2 else colour, "ms": 3.5, "lw": 1.0}
+            handles[model.model] = ax.errorbar(at, value, bars, fmt=marker, **look)
+        claimed: Any = {"color": style.BLACK, "ls": style.DASHES[1], "lw": 0.8}
         for j, level in enumerate(levels):
-            (line,) = ax.plot([j - 0.45, j + 0.45], [100.0 * level] * 2, color=BLACK, ls=DASHES[1],
-                              lw=0.8)  # fmt: skip
+            (line,) = ax.plot([j - 0.45, j + 0.45], [100.0 * level] * 2, **claimed)
             handles["claimed"] = line
-        ax.set_xticks(range(len(levels)), [f"{100 * level:g} % band" for level in levels])
+        ax.set_xticks(range(levels.size), [f"{100 * level:g} % band" for level in levels])
         ax.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:.0f}"))
         ax.set_ylabel("Covered (% of held-out measurements)")
-        legend_below(figure, handles, 3)
+        style.legend_below(figure, handles, 3)
     return figure
 
 
@@ -154,10 +133,8 @@ def render(score: SbcScore, images: Mapping[str, str], command: Sequence[str]) -
     )
 
 
-_HEAD = (
-    "Model", "Campaigns", "Not converged", "Extended", "Least p of a quantity, adjusted",
-    "50 % band covers", "90 %", "95 %",
-)  # fmt: skip
+_HEAD = ["Model", "Campaigns", "Not converged", "Extended", "Least p of a quantity, adjusted"]
+_HEAD += ["50 % band covers", "90 %", "95 %"]
 
 
 def _row(m: ModelScore) -> list[str]:
@@ -166,10 +143,9 @@ def _row(m: ModelScore) -> list[str]:
         for c in m.coverage
     ]
     failed = f" ({len(m.failed)} failed)" if m.failed else ""
-    return [
-        m.model, f"{m.replicates}{failed}", str(m.unconverged), str(m.extended),
-        short(min(min(1.0, q.p * len(m.quantities)) for q in m.quantities)), *covered,
-    ]  # fmt: skip
+    least = min(1.0, min(q.p for q in m.quantities) * len(m.quantities))
+    ended = f"{m.replicates}{failed}", str(m.unconverged), str(m.extended)
+    return [m.model, *ended, short(least), *covered]
 
 
 def text_table(score: SbcScore) -> str:
@@ -186,7 +162,7 @@ def document(score: SbcScore, settings: dict[str, Any]) -> dict[str, Any]:
         "simulations": score.simulations,
         "settings": settings,
         "alarms": [f"{model}: {name}" for model, name in score.alarms],
-        "models": {m.model: _model(m, adjusted) for m in score.models},
+        "models": {m.model: finite(_model(m, adjusted)) for m in score.models},
     }
 
 
@@ -201,9 +177,9 @@ def _model(m: ModelScore, adjusted: dict[tuple[str, str], float]) -> dict[str, A
         "held_out_without_band": m.no_band,
         "coverage": {
             f"{100 * c.level:g}": {
-                "proportion": finite(c.proportion),
-                "standard_error": finite(c.se),
-                "interval": finite(c.interval),
+                "proportion": c.proportion,
+                "standard_error": c.se,
+                "interval": c.interval,
                 "measurements": c.rows,
                 "campaigns": c.replicates,
                 "p": c.p,

@@ -31,26 +31,12 @@ type Document = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Target:
-    """Where and how a section writes its files.
+    """Where and how a section writes its files."""
 
-    Parameters
-    ----------
-    folder : Path
-        Of the report; it has ``figures``.
-    versions : mapping of str to str
-        Of the packages, for pages in the folder.
-    pdf : bool
-        Whether figures also come as PDF.
-    pool : Executor
-        Where figures are drawn.
-    tell : callable
-        Called with a step's name, the steps done and planned.
-    """
-
-    folder: Path
-    versions: Mapping[str, str]
-    pdf: bool = False
-    pool: Executor = HERE
+    folder: Path  # of the report; it has `figures`
+    versions: Mapping[str, str]  # of the packages, for pages in the folder
+    pdf: bool = False  # whether figures also come as PDF
+    pool: Executor = HERE  # where figures are drawn
     tell: Progress = lambda what, done, planned: None
 
 

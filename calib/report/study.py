@@ -253,30 +253,21 @@ def fitted_rows(task: Task) -> tuple[Table, Table | None]:
 class OutputResult:
     """What a study found for one output, calibrated on the rows that are not held out.
 
-    Parameters
-    ----------
-    estimates : tuple of PointEstimate
-        Every applicable method, on all rows the source fitted.
-    by_pressure : mapping of float to tuple of PointEstimate
-        The Magic Formula at each inflation pressure (psi) on its own; empty for other models.
-    prior_predictive, posterior_predictive : ndarray, shape (draws, n)
-        Measurements that are expected at the calibration conditions.
-    seconds : mapping of str to float
-        Of each step of the work.
-    preference : NoisePreference, optional
-        Of the noise that the prior file asks for over the usual one.
+    The predictive measurements, shape (draws, n), are at the calibration conditions; seconds are of
+    each step of the work.
     """
 
     task: Task
     calibration: Calibration
     validation: Validation
-    estimates: tuple[PointEstimate, ...]
+    estimates: tuple[PointEstimate, ...]  # by every method, on all rows that the source fitted
+    # Of the Magic Formula at each inflation pressure (psi) on its own; empty for other models.
     by_pressure: Mapping[float, tuple[PointEstimate, ...]]
     prior_predictive: Array
     posterior_predictive: Array
     seconds: Mapping[str, float] = field(default_factory=dict)
     sensitivity: Mapping[str, Sensitivity] = field(default_factory=dict)
-    preference: NoisePreference | None = None
+    preference: NoisePreference | None = None  # of the prior file's noise over the usual one
 
     @cached_property
     def evidence(self) -> Evidence:

@@ -64,78 +64,36 @@ class Level(StrEnum):
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a verdict is made from.
-
-    Parameters
-    ----------
-    held_out : bool
-        Whether rows were held out; otherwise each was left out in turn.
-    hits, n : int
-        Unseen rows inside the 90 % band, and all.
-    low_coverage_p : float
-        Probability of covering no more than that, were the bands right.
-    effective : float
-        Independent rows that would say as much.
-    max_relative_error : float
-        NaN where no row is large enough to be judged.
-    prior_set : sequence of str
-        Parameters whose width is the prior's.
-    two_pressures : bool
-        Whether a quadratic in pressure was calibrated at two pressures.
-    skill : float
-        Part of the scatter of unseen rows about the calibrated mean that the median removes.
-    sign_changes, neighbours : int
-        Of the residuals along the curve, which runs `along` a condition.
-    inside : str
-        The calibrated range in words.
-    unseen_at : Where
-        Where in pressure the unseen rows lie.
-    at_pressures : str
-        The two calibrated pressures and the range of the curves there.
-    prior_hits, prior_n : int
-        Calibrated points inside the priors' 95 % predictive band, and all.
-    suspects : str
-        What to check where the priors did not expect the data.
-    notes : sequence of str
-        What was assumed where the data do not say.
-    emulator_fails : sequence of str
-        Why the emulator of the simulator, if there is one, is not good enough.
-    remarks : sequence of Remark
-        What the rows and the posterior say of the assumptions.
-    checks : sequence of Check
-        Those of the rows and the priors; the coverage and the signs of residuals are of the family.
-    fitted_at : sequence of float
-        The two calibrated pressures, in canonical units, of the column `parabolic_in`.
-    """
+    """What a verdict is made from; rows that were not fitted are called unseen."""
 
     converged: bool
     reasons: Sequence[str]
-    held_out: bool
-    hits: int
-    n: int
-    low_coverage_p: float
-    effective: float
+    held_out: bool  # whether rows were; otherwise each was left out in turn
+    hits: int  # unseen rows inside the 90 % band
+    n: int  # unseen rows
+    low_coverage_p: float  # of covering no more than that, were the bands right
+    effective: float  # independent rows that would say as much
     rmse: float
     unit: str
-    max_relative_error: float
-    prior_set: Sequence[str]
-    two_pressures: bool
-    skill: float
-    sign_changes: int
+    max_relative_error: float  # NaN where no row is large enough to be judged
+    prior_set: Sequence[str]  # parameters whose width is the prior's
+    two_pressures: bool  # whether a quadratic in pressure was calibrated at two pressures
+    skill: float  # part of the scatter about the calibrated mean that the median removes
+    sign_changes: int  # of the residuals along the curve
     neighbours: int
-    along: str
-    inside: str
+    along: str  # the condition that the curve runs along
+    inside: str  # the calibrated range in words
     unseen_at: Where = Where.AT
-    at_pressures: str = "the two calibrated pressures"
-    prior_hits: int = 0
+    at_pressures: str = "the two calibrated pressures"  # with the range of the curves there
+    prior_hits: int = 0  # calibrated points inside the priors' 95 % predictive band
     prior_n: int = 0
-    suspects: str = "the units"
-    notes: Sequence[str] = ()
-    emulator_fails: Sequence[str] = ()
-    remarks: Sequence[Remark] = ()
-    checks: Sequence[Check] = ()
-    parabolic_in: str = ""
-    fitted_at: Sequence[float] = ()
+    suspects: str = "the units"  # to be checked where the priors did not expect the data
+    notes: Sequence[str] = ()  # what was assumed where the data do not say
+    emulator_fails: Sequence[str] = ()  # why the simulator's emulator is not good enough
+    remarks: Sequence[Remark] = ()  # of the rows and the posterior on the assumptions
+    checks: Sequence[Check] = ()  # of the same family as coverage and signs of residuals
+    parabolic_in: str = ""  # canonical column of that quadratic
+    fitted_at: Sequence[float] = ()  # its two calibrated values
 
 
 @dataclass(frozen=True)
@@ -190,11 +148,8 @@ class Verdict:
         doubted = not self.where or any(part.holds(conditions) for part in self.where)
         if self.level is not Level.FINE and (said or doubted):
             said.append(f"{self.headline}: do not trust {self.doubt}")
-        if self.held_out:
-            said.insert(
-                0, words("verdict.j2", "calib.report", part="held out", held_out=self.held_out)
-            )  # fmt: skip
-        return tuple(said)
+        held = [_words("held out", held_out=self.held_out)] if self.held_out else []
+        return (*held, *said)
 
     def document(self) -> dict[str, Any]:
         """Return it as JSON has it, which knows no infinity."""
@@ -211,37 +166,42 @@ class Verdict:
 
 
 def _written(ranges: Sequence[Range]) -> list[dict[str, Any]]:
-    return [{k: None if v in (-math.inf, math.inf) else v for k, v in r._asdict().items()}
-            for r in ranges]  # fmt: skip
+    ends = (-math.inf, math.inf)
+    return [{k: None if v in ends else v for k, v in r._asdict().items()} for r in ranges]
 
 
 def _read(ranges: Sequence[Mapping[str, Any]]) -> tuple[Range, ...]:
+    open_ended: dict[str, Any] = {"low": -math.inf, "high": math.inf}
     return tuple(
-        Range(
-            r["column"], -math.inf if r["low"] is None else r["low"],
-            math.inf if r["high"] is None else r["high"],
-        )
-        for r in ranges
-    )  # fmt: skip
+        Range(**{k: open_ended[k] if v is None else v for k, v in r.items()}) for r in ranges
+    )
 
 
-def _said(part: str, e: Evidence, **facts: Any) -> str:
-    return words("verdict.j2", "calib.report", part=part, e=e, **facts)
+def _words(part: str, **facts: Any) -> str:
+    return words("verdict.j2", "calib.report", part=part, **facts)
 
 
 # What decides where no assumption fails: the first rule that holds.
 _RULES: tuple[tuple[str, Level, str, Callable[[Evidence], bool]], ...] = (
     ("not converged", Level.NO, "NOT CONVERGED", lambda e: not e.converged),
     ("not scored", Level.NO, "Not validated", lambda e: e.n > 0 and not math.isfinite(e.rmse)),
-    ("extrapolated", Level.CARE, "Curvature from the prior",
-     lambda e: e.two_pressures and len(e.prior_set) > 0),
+    (
+        "extrapolated",
+        Level.CARE,
+        "Curvature from the prior",
+        lambda e: e.two_pressures and len(e.prior_set) > 0,
+    ),
     ("not validated", Level.CARE, "Not validated", lambda e: e.n == 0),
     # Were none of them covered, it would not be found.
-    ("few", Level.CARE, "Too few unseen rows",
-     lambda e: binomial_p(0, e.n) > LEVEL / (len(e.checks) + 2)),
+    (
+        "few",
+        Level.CARE,
+        "Too few unseen rows",
+        lambda e: binomial_p(0, e.n) > LEVEL / (len(e.checks) + 2),
+    ),
     ("weak", Level.CARE, "Explains little", lambda e: e.skill < WEAK_SKILL),
     ("fine", Level.FINE, "Holds on unseen rows", lambda e: True),
-)  # fmt: skip
+)
 
 # What decides where one fails, by the title of its remark.
 _FAILS = {
@@ -254,36 +214,27 @@ _FAILS = {
 
 def judge_evidence(e: Evidence) -> Verdict:
     """Apply the rules."""
-    tests = [
-        *e.checks,
-        Check(e.low_coverage_p, Remark(_said("coverage", e), "Bands too narrow")),
-        Check(binomial_p(e.sign_changes, e.neighbours, 0.5),
-              Remark(_said("pattern", e), "Curve misses a pattern", True)),
-    ]  # fmt: skip
-    emulated = (_said("emulator", replace(e, emulator_fails=[why])) for why in e.emulator_fails)
-    remarks = [
-        *(Remark(text, "Emulator not good enough", True) for text in emulated),
-        *e.remarks,
-        *failed(tests),
-    ]
+    coverage = Remark(_words("coverage", e=e), "Bands too narrow")
+    pattern = Remark(_words("pattern", e=e), "Curve misses a pattern", True)
+    signs_p = binomial_p(e.sign_changes, e.neighbours, 0.5)
+    emulated = (_words("emulator", failure=why) for why in e.emulator_fails)
+    remarks = [Remark(text, "Emulator not good enough", True) for text in emulated]
+    remarks += e.remarks
+    remarks += failed([*e.checks, Check(e.low_coverage_p, coverage), Check(signs_p, pattern)])
     if e.prior_hits < EXPECTED * e.prior_n:
-        remarks.append(Remark(_said("surprise", e), "Data and priors disagree", True))
+        remarks.append(Remark(_words("surprise", e=e), "Data and priors disagree", True))
     remarks.sort(key=lambda remark: not remark.title)
     rule, level, headline, _ = next(r for r in _RULES if r[3](e))
     fails = [remark for remark in remarks if remark.title] if level is not Level.NO else []
-    facts = {"rule": rule, "fails": fails, "shifts": any(remark.shifts for remark in fails)}
-    found = Verdict(
-        level, rule, headline, _said("trust", e, **facts), _said("doubt", e, **facts),
-        tuple(remarks),
-    )  # fmt: skip
+    facts = {"e": e, "rule": rule, "fails": fails, "shifts": any(r.shifts for r in fails)}
+    trust, doubt = _words("trust", **facts), _words("doubt", **facts)
+    where: tuple[Range, ...] = ()
     if fails:
-        title = fails[0].title
-        return replace(
-            found, level=Level.CARE, headline=title, rule=_FAILS.get(title, "assumption")
-        )
-    if rule == "extrapolated":
-        return replace(found, where=_elsewhere(e.parabolic_in, e.fitted_at))
-    return found
+        level, headline = Level.CARE, fails[0].title
+        rule = _FAILS.get(headline, "assumption")
+    elif rule == "extrapolated":
+        where = _elsewhere(e.parabolic_in, e.fitted_at)
+    return Verdict(level, rule, headline, trust, doubt, tuple(remarks), where)
 
 
 def _elsewhere(column: str, values: Sequence[float]) -> tuple[Range, ...]:
@@ -349,6 +300,7 @@ def gather(calibration: Calibration, v: Validation | None, prior_predictive: Arr
     """
     result, problem = Fitted(calibration, v), calibration.problem
     model, parabolic = problem.bound.model, problem.bound.model.parabolic_in
+    held = held_table(result)
     fitted_at = np.unique(problem.table[parabolic]) if parabolic else np.zeros(0)
     changes, neighbours = signs_along(result, standardise(calibration, problem).residual)
     with units_of(problem.table.header):
@@ -362,7 +314,8 @@ def gather(calibration: Calibration, v: Validation | None, prior_predictive: Arr
         return Evidence(
             converged=calibration.draws.report.passed,
             reasons=calibration.draws.report.reasons,
-            **_unseen(result, v),
+            held_out=held is not None,
+            **_unseen(problem, v),
             unit=axis_of(model.output).unit,
             prior_set=[p for p in problem.names if role(calibration, p) in (PRIOR, MOVED)],
             two_pressures=fitted_at.size == 2,
@@ -370,15 +323,11 @@ def gather(calibration: Calibration, v: Validation | None, prior_predictive: Arr
             neighbours=neighbours,
             along=x.name.lower(),
             inside=joined(list(ranges.values())),
-            unseen_at=_unseen_at(problem, v)
-            if parabolic and v and held_table(result)
-            else Where.AT,
+            unseen_at=_unseen_at(fitted_at, held[parabolic]) if parabolic and held else Where.AT,
             at_pressures=at_pressures,
             prior_hits=hits(prior_predictive, problem.observed, 0.95),
             prior_n=problem.observed.size,
-            suspects="the units and the normal load"
-            if role_of(model.output) == "pull"
-            else "the units",
+            suspects="the units" + " and the normal load" * (role_of(model.output) == "pull"),
             notes=problem.notes,
             remarks=remarks_of(calibration),
             checks=checks_of(calibration),
@@ -387,29 +336,24 @@ def gather(calibration: Calibration, v: Validation | None, prior_predictive: Arr
         )
 
 
-def _unseen(result: Fitted, v: Validation | None) -> dict[str, Any]:
+def _unseen(problem: Problem, v: Validation | None) -> dict[str, Any]:
     """Return what was found on rows that were not fitted."""
     nothing = float("nan")
     if v is None:
-        return {
-            "held_out": False, "hits": 0, "n": 0, "low_coverage_p": 1.0, "effective": nothing,
-            "rmse": nothing, "max_relative_error": nothing, "skill": nothing,
-        }  # fmt: skip
-    problem = result.calibration.problem
+        scores = dict.fromkeys(("effective", "rmse", "max_relative_error", "skill"), nothing)
+        return {"hits": 0, "n": 0, "low_coverage_p": 1.0, **scores}
     covered = v.scores.coverage[0.9]
-    held = held_table(result) is not None
     complete = bool(np.isfinite(v.draws).all(axis=1).any())
     scatter = float(np.mean(np.square(v.observed - problem.observed.mean())))
+    if complete and v.method == "held_out":
+        # Held-out rows share a curve, so the binomial law would raise false alarms.
+        low_coverage_p = coverage_probability(v.draws, covered.hits, 0.9)
+    else:
+        low_coverage_p = binomial_p(covered.hits, covered.n)
     return {
-        "held_out": held,
         "hits": covered.hits,
         "n": covered.n,
-        "low_coverage_p": (
-            # Held-out rows share a curve, so the binomial law would raise false alarms.
-            coverage_probability(v.draws, covered.hits, 0.9)
-            if held and complete
-            else binomial_p(covered.hits, covered.n)
-        ),
+        "low_coverage_p": low_coverage_p,
         "effective": effective_rows(v.draws) if complete else nothing,
         "rmse": axis_of(problem.bound.model.output).factor * v.scores.rmse,
         "max_relative_error": v.scores.max_relative_error,
@@ -417,9 +361,7 @@ def _unseen(result: Fitted, v: Validation | None) -> dict[str, Any]:
     }
 
 
-def _unseen_at(problem: Problem, validation: Validation) -> Where:
-    column = problem.bound.model.parabolic_in
-    fitted, unseen = problem.table[column], validation.table[column]
+def _unseen_at(fitted: Array, unseen: Array) -> Where:
     if bool(((unseen < fitted.min()) | (unseen > fitted.max())).any()):
         return Where.BEYOND
     return Where.AT if bool(np.isin(unseen, fitted).any()) else Where.BETWEEN

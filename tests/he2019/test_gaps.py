@@ -27,11 +27,11 @@ from calib.inference.calibration import calibrate
 from calib.inference.sampler import SamplerSettings
 from calib.models import get_model
 from calib.models.soil import rut_depth as eq_21
-from calib.report.figures.gap import output_rows
 from calib.report.figures.style import Plate
 from calib.report.gap_words import short_name
 from calib.report.labels import odds_text, short
 from calib.report.page.template import template
+from calib.report.rows import output_rows
 from calib.report.sections import Report
 from calib.report.study import Study
 from calib.report.writer import file_hashes, write_report

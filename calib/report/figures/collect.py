@@ -35,17 +35,9 @@ def plates(result: OutputResult, reference: Reference = NOTHING) -> list[Plate]:
 
 @dataclass(frozen=True)
 class Drawn:
-    """Figures of an output.
+    """Figures of an output: PNG, and PDF where it was asked for, by file name."""
 
-    Parameters
-    ----------
-    plates : tuple of Plate
-        In reading order, without their figures.
-    files : mapping of str to bytes
-        PNG, and PDF where it was asked for, by file name.
-    """
-
-    plates: tuple[Plate, ...]
+    plates: tuple[Plate, ...]  # in reading order, without their figures
     files: Mapping[str, bytes]
 
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.cluster.hierarchy import leaves_list, linkage
 from scipy.spatial.distance import squareform
 
-from calib.data.quantities import columns_of, role_of
+from calib.data.quantities import role_of
 from calib.gap.constants import ALIKE
 from calib.gap.document import Design, GapDocument
 from calib.gap.mixture import Region
@@ -38,93 +37,15 @@ from calib.report.figures.style import (
     Plate,
     panels,
 )
-from calib.report.gap_words import TIE, Notation, Words, chance, short_name
+from calib.report.gap_words import TIE, Words, chance, short_name
 from calib.report.labels import MINUS, NO_UNIT, Axis, axis_of, percent_range, short, units_of
+from calib.report.rows import OutputRows, Z, abscissa, column_of, output_rows, panel_groups
 
 _BAND = "#e6e6e6"
 # White to dark: how probable it is that a gap exceeds the noise. It survives greyscale.
 _PROBABLE = LinearSegmentedColormap.from_list("probable", ["#ffffff", "#f6c9a5", "#D55E00"])
 _NORM = Normalize(0.0, 1.0)
-# Half the width of a 90 % interval, in sds.
-_Z = 1.64
 _SPECIAL = ("none", "unknown", "parameter_shift")
-
-
-@dataclass(frozen=True)
-class OutputRows:
-    """Field rows of one output on the scale of its axis, arrays of shape (n,).
-
-    The reading, the calibrated simulator before and the corrected one after; the sd of a reading;
-    truth minus simulator, its sd, and the probability that it exceeds the noise.
-    """
-
-    name: str
-    axis: Axis
-    rows: NDArray[np.int64]
-    measured: Array
-    before: Array
-    after: Array
-    noise: Array
-    gap: Array
-    sd: Array
-    probability: Array
-
-    @property
-    def likely(self) -> int:
-        """How many rows probably have a gap."""
-        return int((self.probability > 0.5).sum())
-
-    @property
-    def noise_median(self) -> float:
-        """Median of the noise."""
-        return float(np.median(self.noise))
-
-    @property
-    def largest(self) -> tuple[float, float, float] | None:
-        """The largest gap with its 90 % interval; None where no row shows any."""
-        row = int(np.abs(self.gap).argmax())
-        gap, half = float(self.gap[row]), _Z * float(self.sd[row])
-        shows = abs(gap) + half >= 0.02 * self.noise_median
-        return (gap, gap - half, gap + half) if shows else None
-
-
-def output_rows(d: GapDocument) -> list[OutputRows]:
-    """Return the field rows of every output, as they are drawn."""
-    gathered = []
-    for o in d.outputs:
-        axis = Notation(d).axis(o.name)
-        values = (o.measured, o.before, o.after, o.noise_sd, o.gap, o.gap_sd)
-        scaled = (axis.scale(np.array(v)) for v in values)
-        found = np.array(o.rows), *scaled, np.array(o.probability)
-        rows = OutputRows(o.name, axis, *found)
-        gathered.append(rows)
-    return gathered
-
-
-def _column(d: GapDocument, *roles: str) -> str | None:
-    """Return the first recorded condition of some physical roles."""
-    return next((c for role in roles for c in columns_of(role) if c in d.conditions), None)
-
-
-def _abscissa(d: GapDocument) -> str:
-    return _column(d, "slip", "order") or next(iter(d.conditions))
-
-
-def panel_groups(
-    d: GapDocument, rows: NDArray[np.int64]
-) -> list[tuple[str, NDArray[np.bool_]]]:  # fmt: skip
-    """Split rows by inflation pressure into a few panels: titles and masks."""
-    column = _column(d, "pressure")
-    pressure = np.array(d.conditions[column]) if column else np.zeros(1)
-    if column is None or np.ptp(pressure) == 0.0:
-        return [("", np.ones(rows.size, dtype=np.bool_))]
-    distinct, axis = np.unique(pressure), axis_of(column)
-    if distinct.size <= 4:
-        return [(f"{axis.value_text(p)} {axis.unit}", pressure[rows] == p) for p in distinct]
-    edges = np.quantile(pressure, [0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0])
-    group = np.searchsorted(edges[1:-1], pressure[rows])
-    titles = [axis.range_text(np.array(ends)) for ends in pairwise(edges)]
-    return [(title, group == k) for k, title in enumerate(titles)]
 
 
 # Where
@@ -136,7 +57,7 @@ def where_plate(d: GapDocument, say: Words) -> Plate:
     columns = max(len(panel_groups(d, o.rows)) for o in outputs)
     margins = {"left": 16.0, "right": 4.0, "bottom": 25.0, "gap_x": 5.0, "gap_y": 7.0}
     fig, axes = panels(len(outputs), columns, height=44.0, sharex=True, sharey="row", **margins)
-    name, slip = _abscissa(d), _column(d, "slip") or ""
+    name, slip = abscissa(d), column_of(d, "slip") or ""
     x_axis = axis_of(name)
     x = x_axis.scale(np.array(d.conditions[name]))
     for row, own in zip(axes, outputs, strict=True):
@@ -204,8 +125,8 @@ def conditions_plate(d: GapDocument, say: Words) -> Plate | None:
 def _limits(own: OutputRows) -> tuple[float, float]:
     """Room for all bars, and for two noise sds to either side."""
     least = 2.0 * float(own.noise.mean())
-    low = min(float((own.gap - _Z * own.sd).min()), -least)
-    high = max(float((own.gap + _Z * own.sd).max()), least)
+    low = min(float((own.gap - Z * own.sd).min()), -least)
+    high = max(float((own.gap + Z * own.sd).max()), least)
     return low - 0.06 * (high - low), high + 0.08 * (high - low)
 
 
@@ -233,7 +154,7 @@ def _span(ax: Axes, region: Region, axis: Axis, values: Array) -> None:
 
 def _points(ax: Axes, x: Array, own: OutputRows, mask: NDArray[np.bool_]) -> None:
     ax.axhline(0.0, color=GREY, lw=0.6, zorder=1)
-    gap, half = own.gap[mask], _Z * own.sd[mask]
+    gap, half = own.gap[mask], Z * own.sd[mask]
     ax.errorbar(x, gap, half, fmt="none", ecolor=BLACK, elinewidth=0.6, zorder=2)
     look: Any = {"s": 20.0, "edgecolors": BLACK, "linewidths": 0.6, "zorder": 3}
     ax.scatter(x, gap, c=own.probability[mask], cmap=_PROBABLE, norm=_NORM, **look)
@@ -296,7 +217,7 @@ def which_plate(d: GapDocument, say: Words) -> Plate:
 
 def left_over_plate(d: GapDocument, say: Words) -> Plate:
     """Draw standardised residuals of the best hypothesis over slip and run order."""
-    columns = [c for role in ("slip", "order") if (c := _column(d, role))] or [_abscissa(d)]
+    columns = [c for role in ("slip", "order") if (c := column_of(d, role))] or [abscissa(d)]
     margins = {"left": 13.0, "right": 4.0, "bottom": 16.0, "gap_x": 6.0}
     fig, axes = panels(1, len(columns), height=44.0, sharey=True, **margins)
     handles = {}
@@ -368,20 +289,11 @@ def isolability_plate(d: GapDocument, say: Words) -> Plate | None:
     words = [textwrap.fill(short_name(name), 27) for name in names]
     # Names stand to the left of the matrix and, turned, below it: 1.45 mm a letter.
     margin = 5.0 + 1.45 * max(len(line) for w in words for line in w.splitlines())
-    bottom = max(margin, 14.0)
     # The matrix is square; the two strips share its rows.
     square = min(side, 86.0)
     strip = 0.5 * (style.DOUBLE_MM - margin - 20.0 - square)
-    fig, axes = panels(
-        1,
-        3,
-        height=side,
-        left=margin,
-        right=4.0,
-        bottom=bottom,
-        gap_x=8.0,
-        width_ratios=(square, strip, strip),
-    )
+    margins = {"left": margin, "right": 4.0, "bottom": max(margin, 14.0), "gap_x": 8.0}
+    fig, axes = panels(1, 3, height=side, width_ratios=(square, strip, strip), **margins)
     matrix, absorbed, smallest = axes[0]
     _matrix(matrix, design, names, words)
     y = np.arange(n)
@@ -394,8 +306,8 @@ def isolability_plate(d: GapDocument, say: Words) -> Plate | None:
     for yi, x, value in zip(y, shown, size, strict=True):
         text = short(float(value)) if value < 100.0 else "none"
         smallest.text(x + 0.12, yi, text, va="center", fontsize=SMALLEST_PT)
+    smallest.set(xlabel="Smallest size that\nshows (noise sd)")
     smallest.set_xlim(0.0, max(1.25 * float(shown.max()), 1.5))
-    smallest.set_xlabel("Smallest size that\nshows (noise sd)")
     for ax in (absorbed, smallest):
         ax.set(ylim=(n - 0.5, -0.5), yticks=[])
         ax.spines["left"].set_visible(False)
@@ -458,8 +370,8 @@ def how_far_plate(d: GapDocument, say: Words) -> Plate:
     outputs = output_rows(d)
     margins = {"left": 15.0, "right": 4.0, "bottom": 17.0, "gap_x": 16.0, "gap_y": 14.0}
     fig, axes = panels(len(outputs), 3, height=46.0, **margins)
-    axis = axis_of(_abscissa(d))
-    x = axis.scale(np.array(d.conditions[_abscissa(d)]))
+    axis = axis_of(abscissa(d))
+    x = axis.scale(np.array(d.conditions[abscissa(d)]))
     for row, own in zip(axes, outputs, strict=True):
         handles = _against(row[0], own, say.n.output(own.name))
         _errors(row[1], x[own.rows], own)
@@ -491,7 +403,7 @@ def _against(ax: Axes, own: OutputRows, word: str) -> dict[str, Any]:
 
 def _errors(ax: Axes, x: Array, own: OutputRows) -> None:
     before, after = own.measured - own.before, own.measured - own.after
-    _noise_band(ax, x, own.noise, _Z)
+    _noise_band(ax, x, own.noise, Z)
     ax.vlines(x, after, before, color="#bdbdbd", lw=0.8, zorder=1)
     ax.plot(x, before, ms=3.6, zorder=2, **_BEFORE)
     ax.plot(x, after, ms=4.2, zorder=3, **_AFTER)

@@ -191,24 +191,12 @@ def _saved(figure: Figure, **form: Any) -> bytes:
 
 @dataclass(frozen=True, eq=False)
 class Plate:
-    """A figure to be shown.
-
-    Parameters
-    ----------
-    figure : Figure or None
-        None if it could not be drawn; the caption then says why.
-    name : str
-        Stem of its file.
-    caption : str
-        What it shows, in words and numbers.
-    heading : str
-        What it is, in a few words.
-    """
+    """A figure to be shown; it is None if it could not be drawn, and the caption says why."""
 
     figure: Figure | None
-    name: str
-    caption: str
-    heading: str = ""
+    name: str  # stem of its file
+    caption: str  # what it shows, in words and numbers
+    heading: str = ""  # what it is, in a few words
 
 
 def draw_all(drawings: Mapping[str, Callable[[], Plate | None]]) -> list[Plate]:

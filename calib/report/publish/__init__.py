@@ -34,24 +34,12 @@ _NORMAL = dict.fromkeys(("family", "correlated_along", "depends_on", "against_no
 
 @dataclass(frozen=True)
 class Publication:
-    """What a paper takes from a report.
+    """What a paper takes from a report."""
 
-    Parameters
-    ----------
-    files : mapping of str to str
-        Text by path in the report's folder.
-    tables : tuple of (str, str, tuple of str)
-        Topic, CSV file and LaTeX files of every table.
-    methods : tuple of (str, str)
-        Heading, empty for the first, and text of every paragraph of the methods.
-    references : tuple of str
-        A line for every reference that they cite.
-    """
-
-    files: Mapping[str, str]
-    tables: tuple[tuple[str, str, tuple[str, ...]], ...]
-    methods: tuple[tuple[str, str], ...]
-    references: tuple[str, ...]
+    files: Mapping[str, str]  # text by path in the report's folder
+    tables: tuple[tuple[str, str, tuple[str, ...]], ...]  # topic, CSV file and LaTeX files
+    methods: tuple[tuple[str, str], ...]  # heading, empty for the first, and text of paragraphs
+    references: tuple[str, ...]  # a line for every reference that they cite
 
 
 def publication(manifest: Mapping[str, Any], summary: Mapping[str, Any]) -> Publication:

@@ -12,8 +12,9 @@ from matplotlib.collections import PathCollection
 
 from calib.gap.effects import EFFECTS
 from calib.report.figures import gap as drawings
-from calib.report.figures.gap import gap_plates, output_rows, panel_groups
+from calib.report.figures.gap import gap_plates
 from calib.report.gap_words import short_name
+from calib.report.rows import output_rows, panel_groups
 from tests.report.gap_documents import DOCUMENTS, PULL
 from tests.report.gap_documents import gap as document
 
