@@ -163,29 +163,20 @@ def text(he2019) -> str:
     return text_of(*he2019)
 
 
+# What is no number: those are changed all at once below.
 LEAVES: dict[str, Any] = {
-    "seed": 777, "command": ["calib"], "settings ensembles": 7, "settings steps": 777,
-    "settings max_steps": 77_777, "settings gate rhat_max": 1.07, "settings gate ess_min": 777.0,
-    "settings gate taus_min": 77.0, "tasks drawbar_pull held_out value": 33.0,
-    "tasks rut_depth data sha256": "f" * 64, "tasks rut_depth data file": "data/other.csv",
-    "tasks bulk_density priors sha256": "e" * 64, "tasks bulk_density priors source": "mine.toml",
+    "command": ["calib"],
+    "tasks rut_depth data sha256": "f" * 64,
+    "tasks rut_depth data file": "data/other.csv",
+    "tasks bulk_density priors sha256": "e" * 64,
+    "tasks bulk_density priors source": "mine.toml",
     "tasks rut_depth model": "bekker",
-    **{f"genetic_algorithm {k}": 7777 for k in ("F", "CP", "MP", "NP", "max_iterations")},
-    **{f"versions {k}": "99.9" for k in ("terracalib", "python", "numpy", "scipy", "emcee", "arviz",
-                                         "matplotlib", "corner")},
-    "models rut_depth data n": 777, "models rut_depth data label": "",
-    "models rut_depth data ranges slip_ratio upper": 0.77,
-    **{f"models rut_depth sampling {k}": 7777 for k in ("ensembles", "walkers", "steps")},
+    "models rut_depth data label": "",
     "models rut_depth sampling converged": False,
-    **{f"models rut_depth sampling gate {k}": 7777.0
-       for k in ("largest_rhat", "smallest_ess_bulk", "smallest_ess_tail",
-                 "smallest_steps_over_tau")},
-    **{f"models rut_depth validation {k}": 77 for k in ("n", "rmse", "max_relative_error")},
     "models rut_depth validation coverage 90": 0.0,
-    **{f"models bulk_density validation {k}": 7.7 for k in ("elpd", "elpd_se")},
     "models bulk_density validation refitted": [1, 2, 3],
-    "models drawbar_pull data n_all": 777, "models drawbar_pull estimates": {},
-}  # fmt: skip
+    "models drawbar_pull estimates": {},
+}
 
 
 @pytest.mark.parametrize("path", LEAVES)

@@ -28,30 +28,24 @@ from tests.report.page.test_page import Reader
 NAMED = DOCUMENTS["named"]
 
 
-def read(html: str) -> Reader:
-    reader = Reader()
-    reader.feed(html)
-    return reader
-
-
 @pytest.fixture(scope="module")
 def page(tmp_path_factory):
     folder = tmp_path_factory.mktemp("page")
     write_page(NAMED, folder)
     html = (folder / "index.html").read_text(encoding="utf-8")
-    return folder, html, read(html)
+    return folder, html, Reader(html)
 
 
 @pytest.mark.parametrize("name", DOCUMENTS)
 def test_every_verdict_has_its_page(name):
-    reader = read(render_page(DOCUMENTS[name], [], {}))
+    reader = Reader(render_page(DOCUMENTS[name], [], {}))
     assert reader.open == []
     assert reader.ids[0] == "verdict"
     assert not re.search(r"[{}]\s*[{}%]| ,| ;|None|Undefined", reader.text)
 
 
 def test_what_a_page_says(snapshot):
-    text = read(render_page(DOCUMENTS["recalibrate"], [], {})).text
+    text = Reader(render_page(DOCUMENTS["recalibrate"], [], {})).text
     assert re.sub(r"\s*\n\s*", "\n", text) == snapshot
 
 
@@ -127,7 +121,7 @@ def test_a_folder_is_in_the_units_of_the_files_checks_and_is_rendered_again(tmp_
     again = render_diagnosis(load_document(out))
     assert again["diagnosis.json"] == (out / "diagnosis.json").read_bytes()
     told = json.loads(again["diagnosis.json"])
-    reader = read(again["index.html"].decode())
+    reader = Reader(again["index.html"].decode())
     shrink = told["shrink"]["drawbar_pull"]
     before, after, noise = (
         short(1e3 * shrink[key]) for key in ("rmse_before", "rmse_after", "noise_floor")

@@ -29,7 +29,7 @@ VOID = {"meta", "link", "img", "br", "hr", "input"}
 class Reader(HTMLParser):
     """Collect addresses, anchors and text, and check that tags are closed in order."""
 
-    def __init__(self) -> None:
+    def __init__(self, html: str) -> None:
         super().__init__()
         self.open: list[str] = []
         self.addresses: list[str] = []
@@ -37,6 +37,7 @@ class Reader(HTMLParser):
         self.images: list[dict[str, str | None]] = []
         self.tags: set[str] = set()
         self.text = ""
+        self.feed(html)
 
     def handle_starttag(self, tag, attrs):
         found = dict(attrs)
@@ -65,9 +66,7 @@ def page(results, manifest=(), **kwargs) -> tuple[str, Reader]:
     html = render_page(
         Study(results, 42, 3.2), drawn, manifest=stated | dict(manifest), summary=summary, **kwargs
     )
-    reader = Reader()
-    reader.feed(html)
-    return html, reader
+    return html, Reader(html)
 
 
 @pytest.fixture(scope="module")
@@ -275,6 +274,4 @@ def test_every_model_has_an_equation_and_a_parametrisation(name, tmp_path):
     text = parametrisation(bound.model.parametrisation, bound.references)
     assert "{" not in text
     assert ("must stay positive" in text) == (name == "magic_formula_pressure")
-    reader = Reader()
-    reader.feed(str(written))
-    assert reader.open == []
+    assert Reader(str(written)).open == []
