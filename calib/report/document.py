@@ -25,7 +25,7 @@ from calib.report.study import HoldOut, OutputResult, Study
 from calib.report.verdict import judge_evidence
 from calib.validation.comparison import NoisePreference
 from calib.validation.constants import CONTRACTION_MIN, SENSITIVITY_MIN
-from calib.validation.scores import Scores, role
+from calib.validation.scores import role
 
 SCHEMA = "calib/summary/1"
 
@@ -50,6 +50,8 @@ def summarise(study: Study) -> dict[str, Any]:
 
 def _output(result: OutputResult) -> dict[str, Any]:
     problem = result.calibration.problem
+    columns = (*problem.bound.model.conditions, problem.bound.model.output)
+    warnings = list(judge_evidence(result.evidence).warnings)
     return {
         "model": problem.bound.model.name,
         "output": problem.bound.model.output,
@@ -58,15 +60,12 @@ def _output(result: OutputResult) -> dict[str, Any]:
             "label": problem.table.label,
             "n": len(problem.table),
             "n_all": len(result.task.table),
-            "ranges": {
-                name: _range(problem.table[name])
-                for name in (*problem.bound.model.conditions, problem.bound.model.output)
-            },
+            "ranges": {name: _range(problem.table[name]) for name in columns},
             "held_out": None if result.task.held_out is None else str(result.task.held_out),
         },
         "references": dict(problem.bound.references),
         **_noise(problem.noise, result.preference),
-        **_verdict(result),
+        **({"warnings": warnings} if warnings else {}),
         **summarise_estimates(result.estimates, result.by_pressure),
         "priors": {
             p.name: {"unit": p.unit, "distribution": p.text, **_picked(p, "reason", "source")}
@@ -77,12 +76,6 @@ def _output(result: OutputResult) -> dict[str, Any]:
         "validation": _validation(result),
         "sampling": _sampling(result.calibration),
     }
-
-
-def _verdict(result: OutputResult) -> dict[str, Any]:
-    """What the rows, the prior and the validation say of the assumptions."""
-    said = judge_evidence(result.evidence).warnings
-    return {"warnings": list(said)} if said else {}
 
 
 def _noise(noise: Noise, preference: NoisePreference | None) -> dict[str, Any]:
@@ -164,36 +157,30 @@ def _sensitivity(result: OutputResult) -> dict[str, Any]:
 
 
 def _validation(result: OutputResult) -> dict[str, Any]:
-    v = result.validation
-    return {"method": v.method, **_scores(v.scores)} | (
-        {
-            "elpd": v.elpd,
-            "elpd_se": v.elpd_se,
+    v, s = result.validation, result.validation.scores
+    covered = {f"{100 * level:g}": c for level, c in s.coverage.items()}
+    found = {
+        "method": v.method,
+        **_picked(s, "n", "rmse", "crps", "max_relative_error"),
+        "n_relative_error_above_6_percent": s.n_far,
+        "coverage": {level: c.proportion for level, c in covered.items()},
+        "coverage_interval": {level: [c.lower, c.upper] for level, c in covered.items()},
+        "pit": s.pit.tolist(),
+    }
+    if v.method == "leave_one_out":
+        found |= {
+            **_picked(v, "elpd", "elpd_se"),
             "largest_pareto_k": None if v.pareto_k is None else float(v.pareto_k.max()),
             "refitted": list(v.refitted),
             "refits_not_converged": list(v.unconverged),
         }
-        if v.method == "leave_one_out"
-        else {}
-    )
-
-
-def _scores(s: Scores) -> dict[str, Any]:
-    return {
-        **_picked(s, "n", "rmse", "crps", "max_relative_error"),
-        "n_relative_error_above_6_percent": s.n_far,
-        "coverage": {f"{100 * level:g}": c.proportion for level, c in s.coverage.items()},
-        "coverage_interval": {
-            f"{100 * level:g}": [c.lower, c.upper] for level, c in s.coverage.items()
-        },
-        "pit": s.pit.tolist(),
-    }
+    return found
 
 
 def _sampling(calibration: Calibration) -> dict[str, Any]:
     d, problem = calibration.draws, calibration.problem
     r = d.report
-    mode = problem.theta(d.mode[None])[0].tolist()
+    entries, mode = problem.priors.entries, problem.theta(d.mode[None])[0].tolist()
     return {
         "converged": r.passed,
         "reasons": list(r.reasons),
@@ -204,17 +191,10 @@ def _sampling(calibration: Calibration) -> dict[str, Any]:
             "smallest_steps_over_tau": float((r.steps / r.tau).min()),
         },
         "ensembles": d.t.shape[0],
-        "walkers": d.walkers,
         "steps": r.steps,
         "tau": float(max(r.tau)),
-        "acceptance": d.acceptance,
-        "evaluations": d.evaluations,
-        "log_evidence": d.log_evidence,
-        "mode": {
-            p.name: value
-            for p, value in zip(problem.priors.entries, mode, strict=True)
-            if not p.fixed
-        },
+        **_picked(d, "walkers", "acceptance", "evaluations", "log_evidence"),
+        "mode": {p.name: v for p, v in zip(entries, mode, strict=True) if not p.fixed},
         "log_posterior_at_mode": float(problem.log_prob(d.mode[None])[0]),
     }
 
@@ -294,14 +274,12 @@ class Output:
     @property
     def posterior(self) -> tuple[ParameterSummary, ...]:
         """Summaries of all parameters; NaN for what JSON has no number for."""
-        names = [f.name for f in fields(ParameterSummary) if f.name != "name"]
         read = []
         for name, entry in self.found["posterior"].items():
-            known = {**entry, "sd_ratio": entry["posterior_to_prior_sd"]}
-            numbers: dict[str, Any] = {
-                n: float("nan") if known.get(n) is None else known[n] for n in names
-            }
-            read.append(ParameterSummary(name=name, **numbers))
+            known = {**entry, "sd_ratio": entry["posterior_to_prior_sd"], "name": name}
+            numbers: dict[str, Any] = {f.name: known.get(f.name) for f in fields(ParameterSummary)}
+            missing = {k: float("nan") for k, v in numbers.items() if v is None}
+            read.append(ParameterSummary(**(numbers | missing)))
         return tuple(read)
 
     def hits(self, level: str) -> int:

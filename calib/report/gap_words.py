@@ -1,6 +1,6 @@
 """The verdict on a gap, by ten rules, and the words about a diagnosis.
 
-The sentences are those of ``diagnosis_words.j2``; `Notation` writes the quantities in them.
+The sentences are those of ``diagnosis_words.j2``; `Words.n` writes the quantities in them.
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ def _cause_name(cause: Explanation | Cause) -> str:
     return "something unlisted" if unlisted else short_name(cause.name)
 
 
-class Notation:
+class _Notation:
     """How the quantities of a diagnosis are written, in the units of its files.
 
     Use it within `calib.report.labels.units_of` of the document's headers.
@@ -169,7 +169,6 @@ class Notation:
     # Quantities, by the name of an output or by a column
 
     def axis(self, quantity: str) -> Axis:
-        """Return how an output or a column is written."""
         return output_axis(self.d, quantity)
 
     def _with_unit(self, quantity: str, text: str) -> str:
@@ -177,46 +176,36 @@ class Notation:
         return text if unit in ("number", NO_UNIT) else f"{text} {unit}"
 
     def output(self, name: str) -> str:
-        """Write an output's name."""
         return name.replace("_", " ")
 
     def outputs(self, names: Iterable[str]) -> str:
-        """Write several outputs' names."""
         return joined([self.output(n) for n in names])
 
     def names(self, names: Iterable[str]) -> str:
-        """Write the names of several explanations or causes."""
         return joined([short_name(name) for name in names])
 
     def unit(self, output: str) -> str:
-        """Return the canonical unit of an output."""
         return QUANTITIES[OUTPUTS[output]].unit_word
 
     def quantity(self, column: str) -> str:
-        """Write a condition's name."""
         return self.axis(column).name.lower()
 
     def plain(self, quantity: str, value: float) -> str:
-        """Write a number without its unit."""
         return short(self.axis(quantity).factor * value).replace("-", MINUS)
 
     def value(self, quantity: str, value: float) -> str:
-        """Write a number."""
         return self._with_unit(quantity, self.plain(quantity, value))
 
     def amount(self, quantity: str, mean: float, sd: float) -> str:
-        """Write mean and sd."""
         factor = self.axis(quantity).factor
         return self._with_unit(quantity, format_value(factor * mean, factor * sd))
 
     def shift(self, column: str, mean: float, sd: float) -> str:
-        """Write by how much a condition differs."""
         axis = self.axis(column)
         unit = "percentage points" if axis.unit == "%" else axis.unit
         return f"{format_value(abs(axis.factor * mean), axis.factor * sd)} {unit}"
 
     def change(self, s: Size) -> str:
-        """Write by how much an output differs."""
         if s.relative:
             return f"{format_value(abs(100.0 * s.mean), 100.0 * s.sd)} %"
         return self.amount(s.quantity, abs(s.mean), s.sd)
@@ -237,11 +226,9 @@ class Notation:
         return self.signed(value, 2 if abs(value) < 10.0 else 3)
 
     def count(self, value: float) -> str:
-        """Write a whole number."""
         return f"{value:.0f}".replace("-", MINUS)
 
     def whole(self, ratio: float) -> str:
-        """Write a ratio as a whole percentage, without the sign."""
         return self.count(100.0 * ratio)
 
     def signed(self, value: float, digits: int = 3) -> str:
@@ -257,15 +244,12 @@ class Notation:
         return f"{self.quantity(column)} {text}"
 
     def condition(self, column: str, value: float) -> str:
-        """Write the value of a condition."""
         return self.stretch(column, value, value)
 
     def conditions(self, values: Mapping[str, float]) -> str:
-        """Write the values of several conditions."""
         return joined([self.condition(column, value) for column, value in values.items()])
 
     def region(self, r: Region) -> str:
-        """Write where a region lies."""
         column, (low, high) = next(iter(r.conditions.items()))
         rows = next(o.rows for o in self.d.outputs if o.name == r.output)
         values = np.array(self.d.conditions[column])[list(rows)]
@@ -275,7 +259,6 @@ class Notation:
     # Choices from the document
 
     def title(self, name: str) -> str:
-        """Say what an explanation claims."""
         if name in _TITLES:
             return _TITLES[name]
         known = {**self.d.titles, "parameter_shift": _TITLES["parameter_shift"]}
@@ -350,7 +333,7 @@ class Words:
     """The sentences about one diagnosis, each a macro of ``diagnosis_words.j2``."""
 
     def __init__(self, d: GapDocument) -> None:
-        self.d, self.n = d, Notation(d)
+        self.d, self.n = d, _Notation(d)
         self.tone, self.rule = judge(d)
         self._card: dict[str, Any] = {}
         self._said: Any = template("diagnosis_words.j2", html=False, trim=False).make_module(

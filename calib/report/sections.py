@@ -41,20 +41,12 @@ class Target:
 
 
 class Section[Part](ABC):
-    """A section of a report; `Part` is what it finds.
+    """A section of a report; `Part` is what it finds."""
 
-    Attributes
-    ----------
-    name : str
-        Key in ``manifest.json`` and ``summary.json``.
-    anchor, heading, badge : str
-        On the page; the badge says what its data are called.
-    """
-
-    name: ClassVar[str]
-    anchor: ClassVar[str]
+    name: ClassVar[str]  # key in manifest.json and summary.json
+    anchor: ClassVar[str]  # on the page
     heading: ClassVar[str]
-    badge: ClassVar[str] = ""
+    badge: ClassVar[str] = ""  # what its data are called
 
     @abstractmethod
     def work_out(self, study: Study, pool: Executor, tell: Progress) -> Part:
@@ -75,20 +67,11 @@ class Section[Part](ABC):
 
 @dataclass(frozen=True)
 class SectionKind:
-    """How a reviewer works a section out again.
+    """How a reviewer works a section out again."""
 
-    Parameters
-    ----------
-    name : str
-        Key in the manifest.
-    again : callable
-        ``record -> Section``; raises ValueError if the record is none.
-    derived : callable
-        ``(folder, files) -> {file: text}``: files that follow from others of the report.
-    """
-
-    name: str
-    again: Callable[[Any], Section[Any]]
+    name: str  # key in the manifest
+    again: Callable[[Any], Section[Any]]  # from its record; a ValueError if that is none
+    # From the folder and all of its files, the text of files that follow from others.
     derived: Callable[[Path, Mapping[str, str]], dict[str, str]] = lambda folder, files: {}
 
     def register(self) -> None:
@@ -118,14 +101,13 @@ class EmulatorSection(Section[Mapping[str, Document]]):
         """Render the table of emulators, and of the first runs that failed."""
         from calib.report.page.template import template
 
-        quarters = {
-            model: np.histogram(d["held_out"]["pit"], bins=4, range=(0.0, 1.0))[0]
-            for model, d in part.items() if d["held_out"]
-        }  # fmt: skip
-        return template("emulators.html.j2").render(
-            documents=part, quarters={m: n / max(1, n.sum()) for m, n in quarters.items()},
-            coverage_words=coverage_words, plain_number=plain_number, shown=20,
-        )  # fmt: skip
+        quarters = {}
+        for model, d in part.items():
+            if d["held_out"]:
+                n = np.histogram(d["held_out"]["pit"], bins=4, range=(0.0, 1.0))[0]
+                quarters[model] = n / max(1, n.sum())
+        shown = {"coverage_words": coverage_words, "plain_number": plain_number, "shown": 20}
+        return template("emulators.html.j2").render(documents=part, quarters=quarters, **shown)
 
     @classmethod
     def again(cls, record: Any) -> EmulatorSection:
@@ -172,9 +154,11 @@ def _comparison_again(record: Any) -> Section[Any]:
 
 
 SECTIONS: Registry[SectionKind] = Registry(
-    "section", lambda kind: kind.name, SectionKind("emulators", EmulatorSection.again),
+    "section",
+    lambda kind: kind.name,
+    SectionKind("emulators", EmulatorSection.again),
     SectionKind("comparison", _comparison_again),
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)
@@ -195,22 +179,13 @@ def work_out(
     workers: int = 1,
     pool: Executor = HERE,
 ) -> Report:
-    """Work out all that a report shows.
+    """Work out all that a report shows: outputs and sections, in their order on the page.
 
-    Parameters
-    ----------
-    sections : sequence of Section
-        Beside the outputs, in their order on the page.
-    progress : callable, optional
-        Called with a step's name, the steps done and planned.
-    workers : int
-        Processes for leaving rows out, where outputs are worked out in this process.
-    pool : Executor, optional
-        Where outputs and sections are worked out. The numbers depend neither on it nor on
-        `workers`.
+    Progress is called with a step's name, the steps done and planned. The numbers depend neither on
+    the pool nor on `workers`, which leave rows out where outputs are worked out in this process.
     """
-    from calib.report.study import work_out_study
+    from calib.report.study import silent, work_out_study
 
-    tell = progress or (lambda what, done, planned: None)
+    tell = progress or silent
     study = work_out_study(tasks, seed, pool, settings=settings, tell=tell, workers=workers)
     return Report(study, tuple((s, s.work_out(study, pool, tell)) for s in sections))

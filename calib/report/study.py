@@ -13,6 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -313,7 +314,7 @@ def work_out_study(
 ) -> Study:
     """Work every output out; see `calib.report.sections.work_out`."""
     began = time.perf_counter()
-    inner, inside = (tell, workers) if pool is HERE else (_silent, 1)
+    inner, inside = (tell, workers) if pool is HERE else (silent, 1)
     pieces = {t.output: pool.submit(_attempt, t, seed, settings, inner, inside) for t in tasks}
     results = {}
     for i, (key, piece) in enumerate(pieces.items()):
@@ -325,80 +326,56 @@ def work_out_study(
 
 @one_thread()
 def _attempt(
-    task: Task,
-    seed: int,
-    settings: SamplerSettings | None,
-    progress: Progress,
-    workers: int,
+    task: Task, seed: int, settings: SamplerSettings | None, progress: Progress, workers: int
 ) -> OutputResult | Failure:
     try:
         return _work_out(task, seed, settings, progress, workers)
     except Exception as error:  # whatever fails, the other outputs still come
-        return Failure(task, _without_folder(task, error))
+        # What failed, without the folder that the priors are in.
+        path = task.prior_path or default_priors(task.model)
+        return Failure(task, f"{type(error).__name__}: {error}".replace(str(path), path.name))
 
 
-def _silent(what: str, done: int, planned: int) -> None:
-    pass
-
-
-def _without_folder(task: Task, error: Exception) -> str:
-    """Return what failed, without the folder that the priors are in."""
-    text = f"{type(error).__name__}: {error}"
-    path = task.prior_path or default_priors(task.model)
-    return text.replace(str(path), path.name)
+def silent(what: str, done: int, planned: int) -> None:
+    """Tell nobody of progress."""
 
 
 def _work_out(
     task: Task, seed: int, settings: SamplerSettings | None, progress: Progress, workers: int
 ) -> OutputResult:
-    seconds: dict[str, float] = {}
+    seconds, output = {}, task.output
     fitted, held = fitted_rows(task)
     problem = build_problem(task.model, fitted, task.prior_path)
+
+    def telling(what: str) -> Callable[[int, int], None]:
+        return lambda done, planned: progress(f"{output}: {what}", done, planned)
+
     clock = time.perf_counter()
-    seeding = (estimate(problem, "least_squares", generator(seed, task.output, "seeding")),)
+    seeding = (estimate(problem, "least_squares", generator(seed, output, "seeding")),)
     estimates, by_pressure = estimate_task(task, seed, progress=progress)
     seconds["estimate"] = time.perf_counter() - clock
     clock = time.perf_counter()
-    calibration = calibrate(
-        problem,
-        seed,
-        label=task.output,
-        estimates=seeding,
-        settings=settings,
-        progress=lambda done, planned: progress(f"{task.output}: sampling", done, planned),
-    )
-    keep(task.output, partial(save_calibration, calibration))
+    how: Any = {"estimates": seeding, "settings": settings, "progress": telling("sampling")}
+    calibration = calibrate(problem, seed, label=output, **how)
+    keep(output, partial(save_calibration, calibration))
     seconds["sample"] = time.perf_counter() - clock
     clock = time.perf_counter()
+    how = {"settings": settings, "workers": workers}
     if held is not None:
-        validation = validate_held_out(calibration, held)
+        validation, loo = validate_held_out(calibration, held), None
     else:
-        validation = leave_one_out(
-            calibration,
-            settings=settings,
-            progress=lambda done, n: progress(f"{task.output}: leaving rows out", done, n),
-            workers=workers,
-        )
+        validation = leave_one_out(calibration, progress=telling("leaving rows out"), **how)
+        loo = validation
     preference = noise_preference(
-        calibration, loo=validation if held is None else None, settings=settings, workers=workers,
-        progress=lambda done, n: progress(f"{task.output}: with normal noise", done, n),
-    )  # fmt: skip
+        calibration, loo=loo, progress=telling("with normal noise"), **how
+    )
     seconds["validate"] = time.perf_counter() - clock
     _, replicated = predictive_draws(
-        calibration, problem.conditions, generator(seed, task.output, "replicate")
+        calibration, problem.conditions, generator(seed, output, "replicate")
     )
-    return OutputResult(
-        task,
-        calibration,
-        validation,
-        estimates,
-        by_pressure,
-        prior_predictive(problem, generator(seed, task.output, "prior")),
-        replicated,
-        seconds,
-        prior_sensitivity(calibration),
-        preference,
-    )
+    expected = prior_predictive(problem, generator(seed, output, "prior"))
+    found = validation, estimates, by_pressure, expected, replicated, seconds
+    return OutputResult(task, calibration, *found, prior_sensitivity(calibration), preference)
 
 
 def validated(calibration: Calibration, held: Table | None) -> Validation | None:
@@ -418,7 +395,7 @@ def estimate_task(
     task: Task, seed: int, *, progress: Progress | None = None
 ) -> tuple[tuple[PointEstimate, ...], dict[float, tuple[PointEstimate, ...]]]:
     """Return the point estimates of a task, and those at each inflation pressure on its own."""
-    tell = progress or _silent
+    tell = progress or silent
     # The paper fitted drawbar pull at all pressures, rut depth at the two outer ones.
     everything = task.held_out is None or get_model(task.model).estimates_all_rows
     rows = task.table if everything else fitted_rows(task)[0]
@@ -426,8 +403,7 @@ def estimate_task(
     estimates = _all_methods(
         problem, seed, (task.output,), lambda done, n: tell(f"{task.output}: estimating", done, n)
     )
-    pressures = _each_alone(task, seed)
-    return estimates, pressures
+    return estimates, _each_alone(task, seed)
 
 
 def _all_methods(

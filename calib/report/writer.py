@@ -33,7 +33,7 @@ from calib.report.page.template import equation, parametrisation, picture, templ
 from calib.report.publish import Publication, likelihood, publication
 from calib.report.publish.tables import TICK, TOPICS
 from calib.report.sections import Report, Section, Target, emulation_words
-from calib.report.study import OutputResult, Progress, Study, Task
+from calib.report.study import OutputResult, Progress, Study, Task, silent
 from calib.report.verdict import Level
 
 SCHEMA = "calib/manifest/2"
@@ -104,11 +104,10 @@ def write_report(
     settings : SamplerSettings
         Of the study, for the manifest; so is the command line.
     posteriors : bool
-        Whether to keep the netCDF files, which are megabytes. Where they are left out, the
-        manifest says so and has their hashes.
+        Whether to keep the netCDF files, which are megabytes; the manifest has their hashes.
     views : bool
-        Whether to keep what follows from the numbers: page, figures, tables, diagnoses of gaps. To
-        keep under version control, numbers and inputs are enough; durations go too.
+        Whether to keep what follows from numbers and inputs: page, figures, tables, diagnoses of
+        gaps. Without them durations go too, so that the rest can be kept under version control.
     environment : Environment, optional
         Where the manifest says the report was made: that of this process by default.
     pdf : bool
@@ -121,7 +120,7 @@ def write_report(
     CalibError
         If the folder exists, and an earlier report is not to be replaced, or cannot be written.
     """
-    tell = progress or (lambda what, done, planned: None)
+    tell = progress or silent
     study, where = report.study, environment or Environment.here()
     with fresh_folder(out, overwrite=overwrite) as folder:
         (folder / "figures").mkdir()
