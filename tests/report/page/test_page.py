@@ -10,13 +10,10 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from calib.data import read_table
-from calib.models import MODELS, example_csv
 from calib.report.document import Output
 from calib.report.figures.collect import Drawn
 from calib.report.figures.style import Plate
-from calib.report.page.template import equation, parametrisation
-from calib.report.publish.tables import TICK, TOPICS, Table
+from calib.report.publish.tables import TOPICS, Table
 from calib.report.sections import EmulatorSection
 from calib.report.study import Failure, Study
 from calib.report.writer import render_page
@@ -231,26 +228,6 @@ def test_tables_say_what_set_each_parameter(drawbar, rut):
     assert said.startswith("Every parameter is identified by these data.")
 
 
-def test_estimates_tick_what_equals_the_source(rut, drawbar, density, plate):
-    table = tables_of(output("rut_depth", {"rut_depth": rut}))["estimates"]
-    for row in table.groups[0]:
-        assert row["Regr."].endswith(TICK)
-    assert [row["Table 6"] for row in table.groups[0]][:2] == ["1.996", "1.266"]
-    assert "from all" not in table.caption
-    tables = tables_of(output("drawbar_pull", {"drawbar_pull": drawbar}))
-    assert "from all 42 rows" in tables["estimates"].caption
-    assert "the posterior from 28 rows" in tables["estimates"].caption
-    pressures = tables["by_pressure"]
-    assert [group[0]["Pressure"] for group in pressures.groups] == ["18 psi", "30 psi", "42 psi"]
-    least = next(row for row in pressures.rows if row[1] == "least squares")
-    assert all(cell.endswith(TICK) for cell in least[2:])
-    cost = tables_of(output("bulk_density", {"bulk_density": density}))["estimates"].groups[1][0]
-    assert cost["Parameter"] == "Sum of squares ([u:(g/cm^3)^2])"
-    own = tables_of(output("rut_depth", {"rut_depth": plate}))["estimates"]
-    assert not any("Table" in head for head in own.head)
-    assert len({len(row) for row in own.rows}) == 1
-
-
 def test_a_skewed_parameter_has_a_median_and_no_sd(rut):
     s = rut.calibration.summary
     wide = replace(
@@ -262,16 +239,3 @@ def test_a_skewed_parameter_has_a_median_and_no_sd(rut):
     tables = tables_of(output("rut_depth", {"rut_depth": replace(rut, calibration=calibration)}))
     assert by_name(tables["posterior"])["k"]["Posterior"] == "median 2.0"
     assert by_name(tables["estimates"])["k"]["Posterior"] == "median 2.0 (0 to 90)"
-
-
-@pytest.mark.parametrize("name", MODELS)
-def test_every_model_has_an_equation_and_a_parametrisation(name, tmp_path):
-    example = tmp_path / "example.csv"
-    example.write_text(example_csv(name))
-    bound = MODELS[name].bind(read_table(example))
-    written = equation(bound.model.latex, bound.model.numbers)
-    assert "<mi>" in written
-    text = parametrisation(bound.model.parametrisation, bound.references)
-    assert "{" not in text
-    assert ("must stay positive" in text) == (name == "magic_formula_pressure")
-    assert Reader(str(written)).open == []
