@@ -168,7 +168,6 @@ def page(found: Mapping[str, Any], image: bytes) -> str:
     )
 
 
-SCHEMA = "calib/comparison/2"
 FILE, PAGE, HELD_OUT = "comparison.json", "index.html", "held_out.csv"
 FIGURE = "figures/bands.png"
 
@@ -216,7 +215,7 @@ def document(
     unsound = [name for name, c in candidates.items() if not c.sound]
     stated = stated_of_rows(rows, comparison.weights, unsound)
     return {
-        "schema": SCHEMA,
+        "schema": "calib/comparison/2",
         "seed": comparison.seed,
         **own_names(first),
         "held_out": hold_out,

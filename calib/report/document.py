@@ -27,8 +27,6 @@ from calib.validation.comparison import NoisePreference
 from calib.validation.constants import CONTRACTION_MIN, SENSITIVITY_MIN
 from calib.validation.scores import role
 
-SCHEMA = "calib/summary/1"
-
 
 def summarise(study: Study) -> dict[str, Any]:
     """Return a study's numbers as plain dictionaries.
@@ -40,7 +38,7 @@ def summarise(study: Study) -> dict[str, Any]:
     models: dict[str, Any] = {k: _output(r) for k, r in study.successes.items()}
     models |= {k: {"model": f.task.model, "error": f.error} for k, f in study.failures.items()}
     document = {
-        "schema": SCHEMA,
+        "schema": "calib/summary/1",
         "seed": study.seed,
         "models": {key: models[key] for key in study.results},
     }

@@ -24,6 +24,7 @@ from calib.gap.document import BENCH, Cause, Explanation, GapDocument, Next, Run
 from calib.gap.effects.dependence import PREFIX
 from calib.gap.effects.instruments import EARLY
 from calib.gap.mixture import Region
+from calib.report.constants import SHOWN, SURE, TIE
 from calib.report.labels import (
     MINUS,
     NO_UNIT,
@@ -37,11 +38,6 @@ from calib.report.labels import (
 from calib.report.numbers import format_value
 from calib.report.page.template import template
 from calib.report.rows import output_axis
-
-# From here on a cause, or no gap, is certain.
-SURE = 0.9
-# Explanations within this factor of the best are a tie with it.
-TIE = 0.2
 
 
 class Tone(StrEnum):
@@ -123,9 +119,6 @@ def judge(d: GapDocument) -> tuple[Tone, str]:
         tone = Tone.CARE
     return tone, rule
 
-
-# What is less probable is not spoken of: as a percentage it is below 5.
-_SHOWN = 0.045
 
 _TITLES = {
     "none": "no gap beyond the noise",
@@ -266,7 +259,7 @@ class _Notation:
 
     def probable[T: (Explanation, Cause)](self, items: Iterable[T]) -> list[T]:
         """Return what is probable enough to be spoken of."""
-        return [item for item in items if item.probability >= _SHOWN]
+        return [item for item in items if item.probability >= SHOWN]
 
     def listed(self, items: Iterable[Any], words: Mapping[str, str] | None = None) -> str:
         """List explanations, causes, or pairs of a name and a probability."""
@@ -277,7 +270,7 @@ class _Notation:
         """List the causes that act without what was put in."""
         p = self.d.without_context or {}
         words = {"none": "no gap", "unknown": "something unlisted"}
-        leading = sorted((n for n in p if p[n] >= _SHOWN), key=lambda n: -p[n])[:4]
+        leading = sorted((n for n in p if p[n] >= SHOWN), key=lambda n: -p[n])[:4]
         return joined([f"{words.get(n, short_name(n))} ({odds_text(p[n])})" for n in leading])
 
     def alike(self) -> list[str]:

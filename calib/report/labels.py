@@ -25,10 +25,10 @@ from calib.inference.priors import Prior
 from calib.models import MODELS, Model
 from calib.models.base import Array
 from calib.models.card import text
+from calib.report.numbers import MINUS as MINUS
 from calib.report.numbers import NOTHING, format_number
 
 NO_UNIT = NOTHING
-MINUS = "\N{MINUS SIGN}"
 
 _GREEK = {
     "sigma": "\N{GREEK SMALL LETTER SIGMA}",
@@ -40,7 +40,6 @@ _GREEK = {
 
 # Units by canonical column in which a page shows its values, where they are not the usual ones.
 _UNITS: ContextVar[Mapping[str, str]] = ContextVar("units of a page", default=MappingProxyType({}))
-_FRACTIONS = ("dimensionless", "percent")
 
 
 @contextmanager
@@ -99,7 +98,7 @@ def axis_of(column: str) -> Axis:
     if quantity is None:
         return Axis(column.replace("_", " ").capitalize(), NO_UNIT)
     own = _UNITS.get().get(column, quantity.unit)
-    if own not in (quantity.unit, *_FRACTIONS):
+    if own not in (quantity.unit, "dimensionless", "percent"):
         factor = float(convert(1.0, quantity.unit, own))
         return Axis(quantity.title, unit_plain(own.replace("**", "^").replace("*", " ")), factor)
     unit = quantity.unit.replace("**", "^").replace("*", " ").replace("dimensionless", NO_UNIT)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from calib.inference.calibration import ParameterSummary
 
 NOTHING = "\N{EN DASH}"
-_MINUS = "\N{MINUS SIGN}"
+MINUS = "\N{MINUS SIGN}"
 TIMES = "\N{MULTIPLICATION SIGN}"
 RAISED = "\N{SUPERSCRIPT MINUS}⁰¹²³⁴⁵⁶⁷⁸⁹"
 
@@ -141,7 +141,7 @@ def ascii_text(text: str) -> str:
         return ""
     digits, _, power = text.partition(f"{TIMES}10")
     exponent = f"e{int(lowered(power)):+03d}" if power else ""
-    return digits.replace(_MINUS, "-") + exponent
+    return digits.replace(MINUS, "-") + exponent
 
 
 def lowered(raised: str) -> str:
@@ -167,7 +167,7 @@ def format_at(value: float, last: int) -> str:
 
 def _shows(value: float, last: int) -> bool:
     """Whether anything of a value is left when it is rounded at the digit of 10^last."""
-    return Decimal(_rounded(value, last, 0).replace(_MINUS, "-")) != 0
+    return Decimal(_rounded(value, last, 0).replace(MINUS, "-")) != 0
 
 
 def _times(power: int) -> str:
@@ -193,7 +193,7 @@ def _rounded(value: float, last: int, power: int) -> str:
     shown = Decimal(repr(float(value))).scaleb(-power)
     text = f"{shown:.{decimals}f}" if decimals >= 0 else f"{round(shown, decimals):.0f}"
     zero = Decimal(text) == 0
-    return text.lstrip("-") if zero else text.replace("-", _MINUS)
+    return text.lstrip("-") if zero else text.replace("-", MINUS)
 
 
 def skewed(s: ParameterSummary) -> bool:

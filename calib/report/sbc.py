@@ -23,7 +23,6 @@ from calib.report.page.template import data_uri, template
 from calib.validation.constants import LEVEL
 from calib.validation.sbc import ModelScore, Quantity, SbcScore, ecdf_band
 
-SCHEMA = "calib/sbc/1"
 _TITLES: Mapping[str, str] = {
     "log_likelihood": "log likelihood",
     "prediction": "held-out mean",
@@ -157,7 +156,7 @@ def document(score: SbcScore, settings: dict[str, Any]) -> dict[str, Any]:
     """Return every number of a run as plain dictionaries."""
     adjusted = score.adjusted
     return {
-        "schema": SCHEMA,
+        "schema": "calib/sbc/1",
         "seed": score.seed,
         "simulations": score.simulations,
         "settings": settings,

@@ -36,8 +36,6 @@ from calib.report.sections import Report, Section, Target, emulation_words
 from calib.report.study import OutputResult, Progress, Study, Task, silent
 from calib.report.verdict import Level
 
-SCHEMA = "calib/manifest/2"
-
 
 def file_hashes(folder: Path) -> dict[str, str]:
     """Return the SHA-256 of every file below a folder but the manifest, by relative path."""
@@ -59,7 +57,7 @@ def build_manifest(
     """
     study = report.study
     return {
-        "schema": SCHEMA,
+        "schema": "calib/manifest/2",
         "title": title,
         "command": list(command),
         "seed": study.seed,
@@ -227,12 +225,8 @@ def _copy_inputs(study: Study, folder: Path) -> dict[str, dict[str, Any]]:
 
 
 # A shape beside every colour.
-_LOOKS: Mapping[str, tuple[str, str]] = {
-    Level.FINE: ("\N{HEAVY CHECK MARK}", "fine"),
-    Level.CARE: ("\N{BLACK UP-POINTING TRIANGLE}", "care"),
-    Level.NO: ("\N{HEAVY BALLOT X}", "no"),
-    Level.FAILED: ("\N{HEAVY BALLOT X}", "failed"),
-}
+_MARKS = {Level.FINE: "\N{HEAVY CHECK MARK}", Level.CARE: "\N{BLACK UP-POINTING TRIANGLE}"}
+_FAILED_MARK = "\N{HEAVY BALLOT X}"
 
 
 def _cell(text: str, ticks: bool = False) -> Markup:
@@ -254,8 +248,8 @@ def _section(o: Output, result: OutputResult, drawn: Drawn | None) -> dict[str, 
         "said": said,
         "fit": o.found["validation"],
         "chains": o.found["sampling"],
-        "mark": _LOOKS[verdict.level][0],
-        "tone": _LOOKS[verdict.level][1],
+        "mark": _MARKS.get(verdict.level, _FAILED_MARK),
+        "tone": verdict.level.name.lower(),
         "equation": equation(bound.model.latex, bound.model.numbers),
         "likelihood": to_html(likelihood(o)),
         "parametrisation": said(parametrisation(bound.model.parametrisation, bound.references)),
@@ -301,7 +295,7 @@ def render_page(
         more=[(s, Markup(html)) for s, html in more],
         paper=paper if paper is not None and paper.files else None,
         command=shlex.join(str(part) for part in manifest.get("command", ())),
-        failed_mark=_LOOKS[Level.FAILED][0],
+        failed_mark=_FAILED_MARK,
         times=TIMES,
         html=to_html,
         cell=_cell,

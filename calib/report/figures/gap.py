@@ -24,6 +24,7 @@ from calib.gap.constants import ALIKE
 from calib.gap.document import Design, GapDocument
 from calib.gap.mixture import Region
 from calib.models.base import Array
+from calib.report.constants import TIE
 from calib.report.figures import style
 from calib.report.figures.style import (
     BLACK,
@@ -37,11 +38,10 @@ from calib.report.figures.style import (
     Plate,
     panels,
 )
-from calib.report.gap_words import TIE, Words, chance, short_name
+from calib.report.gap_words import Words, chance, short_name
 from calib.report.labels import MINUS, NO_UNIT, Axis, axis_of, percent_range, short, units_of
 from calib.report.rows import OutputRows, Z, abscissa, column_of, output_rows, panel_groups
 
-_BAND = "#e6e6e6"
 # White to dark: how probable it is that a gap exceeds the noise. It survives greyscale.
 _PROBABLE = LinearSegmentedColormap.from_list("probable", ["#ffffff", "#f6c9a5", "#D55E00"])
 _NORM = Normalize(0.0, 1.0)
@@ -101,7 +101,7 @@ def conditions_plate(d: GapDocument, say: Words) -> Plate | None:
         scaled = replace(own, noise=ones, gap=own.gap / own.noise, sd=own.sd / own.noise)
         for ax, name in zip(row, names, strict=True):
             axis, values = axis_of(name), np.array(d.conditions[name])
-            ax.axhspan(-1.0, 1.0, color=_BAND, lw=0.0, zorder=0)
+            ax.axhspan(-1.0, 1.0, color=style.BAND, lw=0.0, zorder=0)
             for region in d.regions:
                 if region.output == own.name and name in region.conditions:
                     _span(ax, region, axis, values)
@@ -138,7 +138,7 @@ def _noise_band(ax: Axes, x: Array, noise: Array, width: float = 1.0) -> None:
     level = np.full(2, width * noise.mean())
     if np.ptp(x) > 0.0 and x.size > 2:
         level = width * np.polyval(np.polyfit(x, noise, 1), ends)
-    ax.fill_between(ends, -level, level, color=_BAND, lw=0.0, zorder=0)
+    ax.fill_between(ends, -level, level, color=style.BAND, lw=0.0, zorder=0)
     ax.axhline(0.0, color=GREY, lw=0.6, zorder=1)
 
 
@@ -168,7 +168,7 @@ def _key(fig: Figure, *, regions: bool) -> None:
     scale.set_ticks([0.0, 0.5, 1.0])
     scale.outline.set_linewidth(0.5)
     bar.set_title(f"Probability that the gap exceeds the noise ({NO_UNIT})", fontsize=7.0, pad=2.5)
-    handles = {"±1 noise sd of a single reading": Patch(color=_BAND)}
+    handles = {"±1 noise sd of a single reading": Patch(color=style.BAND)}
     if regions:
         region = Patch(facecolor="#fdf3dc", edgecolor=VERMILION, lw=0.8)
         handles["region with a probable gap"] = region

@@ -18,7 +18,7 @@ from calib.inference.estimators import method_name
 from calib.inference.priors import Prior, Priors
 from calib.models.base import Array
 from calib.models.magic_formula import coefficients_at
-from calib.report.constants import WIDE
+from calib.report.constants import EDGE, WIDE
 from calib.report.figures import style
 from calib.report.figures.style import (
     BLACK,
@@ -265,8 +265,6 @@ def _ranks(ax: Axes, values: Array, effective: float) -> None:
 # Point estimates
 
 _METHODS = "geometric", "genetic", "differential_evolution", "least_squares", "published_regression"
-# Estimates farther off than this many posterior sds are drawn at the edge.
-_EDGE = 5.0
 
 
 def _method_look(method: str) -> dict[str, Any]:
@@ -304,7 +302,7 @@ def estimates_plate(result: OutputResult, reference: Reference = NOTHING) -> Pla
         if np.isfinite(distance[-1]):
             handles[f"published ({source})"] = _dot(ax, float(distance[-1]), i, 5.0, ring)
         names.append(f"ln {symbol(name)}" if log else symbol(name))
-    reach = 1.08 * min(_EDGE, reach)
+    reach = 1.08 * min(EDGE, reach)
     ax.set_yticks(range(len(names)), names, fontsize=SYMBOL_PT)
     ax.axvline(0.0, color=GREY, lw=0.5, zorder=0)
     ax.set(xlabel="Distance from the posterior mean (posterior sds)", xlim=(-reach, reach))
@@ -324,9 +322,9 @@ def _distances(
 
 def _dot(ax: Axes, d: float, y: float, zorder: float, look: Mapping[str, Any]) -> Any:
     """A dot; at the edge, with its distance written, where it is far off."""
-    x = float(np.clip(d, -_EDGE, _EDGE))
+    x = float(np.clip(d, -EDGE, EDGE))
     (dot,) = ax.plot(x, y, zorder=zorder, **look)
-    if abs(d) > _EDGE:
+    if abs(d) > EDGE:
         text, away, side = (
             (f"{short(d)} ►", -6.0, "right") if d > 0 else (f"◄ {short(d)}", 6.0, "left")
         )

@@ -11,6 +11,8 @@ import io
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cache
+from importlib import resources
 from typing import Any
 
 import matplotlib as mpl
@@ -38,51 +40,22 @@ BAND = "#e4e4e4"
 
 # Widths of one, one and a half and two columns of a journal.
 SINGLE_MM, MIDDLE_MM, DOUBLE_MM = 90.0, 140.0, 190.0
-# No text is smaller in print; where it has subscripts, which are 0.7 of it, these are 6 pt.
+# As in print.mplstyle: no text is smaller; subscripts, of 0.7 the size, are 6 pt.
 SMALLEST_PT, SYMBOL_PT = 7.0, 8.6
 _MM = 1.0 / 25.4
 
-_RC: dict[Any, Any] = {
-    "font.family": "sans-serif",
-    "font.size": 8.0,
-    "axes.titlesize": 8.0,
-    "axes.labelsize": SYMBOL_PT,
-    "xtick.labelsize": 7.0,
-    "ytick.labelsize": 7.0,
-    "legend.fontsize": 7.0,
-    "legend.frameon": False,
-    "legend.handlelength": 1.8,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.linewidth": 0.6,
-    "axes.titlepad": 4.0,
-    "axes.labelpad": 2.5,
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
-    "xtick.major.size": 2.5,
-    "ytick.major.size": 2.5,
-    "lines.linewidth": 1.2,
-    "lines.markersize": 4.0,
-    "figure.facecolor": "white",
-    "savefig.facecolor": "white",
-    "mathtext.fontset": "dejavusans",
-    "text.hinting": "none",
-    "axes.unicode_minus": True,
-    # Type 3 fonts, the default, are refused by publishers.
-    "pdf.fonttype": 42,
-    # Long tick labels would push the axis label off the figure: a common power of ten instead.
-    "axes.formatter.limits": (-3, 4),
-    "axes.formatter.use_mathtext": True,
-}
+
+@cache
+def _settings() -> Mapping[Any, Any]:
+    with resources.as_file(resources.files(__package__) / "print.mplstyle") as path:
+        found = mpl.rc_params_from_file(path, use_default_template=True)
+    return {name: value for name, value in found.items() if name != "backend"}
 
 
 @contextmanager
 def style() -> Iterator[None]:
     """Draw in the project's style, whatever the user's own settings are."""
-    with mpl.rc_context():
-        mpl.rcParams.update({k: v for k, v in mpl.rcParamsDefault.items() if k != "backend"})
-        for key, value in _RC.items():
-            mpl.rcParams[key] = value
+    with mpl.rc_context(dict(_settings())):
         yield
 
 
