@@ -13,6 +13,7 @@ corner, the bibliography shipped with ArviZ).
 from __future__ import annotations
 
 import re
+import tomllib
 import unicodedata
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
@@ -34,35 +35,7 @@ from calib.report.labels import (
 )
 from calib.report.numbers import RAISED, lowered
 
-_SPECIAL = {
-    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
-    "{": r"\{", "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
-    "<": "$<$", ">": "$>$", "|": "$|$", '"': "''",
-}  # fmt: skip
-_SIGNS = {
-    "\N{MINUS SIGN}": "$-$",
-    "\N{PLUS-MINUS SIGN}": r"$\pm$",
-    "\N{MULTIPLICATION SIGN}": r"$\times$",
-    "\N{LESS-THAN OR EQUAL TO}": r"$\le$",
-    "\N{GREATER-THAN OR EQUAL TO}": r"$\ge$",
-    "\N{EN DASH}": "--",
-    "\N{EM DASH}": "---",
-    "\N{HORIZONTAL ELLIPSIS}": r"\ldots{}",
-    "\N{LEFT SINGLE QUOTATION MARK}": "`",
-    "\N{RIGHT SINGLE QUOTATION MARK}": "'",
-    "\N{LEFT DOUBLE QUOTATION MARK}": "``",
-    "\N{RIGHT DOUBLE QUOTATION MARK}": "''",
-    "\N{DEGREE SIGN}": r"$^{\circ}$",
-    "\N{MICRO SIGN}": r"$\mu$",
-    "\N{NO-BREAK SPACE}": "~",
-    "\N{CHECK MARK}": r"\rlap{$^{\ast}$}",
-}
-# Greek letters that LaTeX has by their names; it lacks those that look Latin.
-_GREEK = frozenset({
-    "alpha", "beta", "gamma", "delta", "epsilon", "zeta", "eta", "theta", "iota", "kappa", "mu",
-    "nu", "xi", "pi", "rho", "sigma", "tau", "phi", "chi", "psi", "omega", "Gamma", "Delta",
-    "Theta", "Xi", "Pi", "Sigma", "Phi", "Psi", "Omega",
-})  # fmt: skip
+_LATEX = tomllib.loads((resources.files("calib.report") / "latex.toml").read_text("utf-8"))
 
 
 def escape(text: str) -> str:
@@ -80,7 +53,7 @@ def escape(text: str) -> str:
 
 @cache
 def _letter(letter: str) -> str:
-    known = _SPECIAL.get(letter) or _SIGNS.get(letter) or _greek(letter)
+    known: str | None = _LATEX["letters"].get(letter) or _greek(letter)
     if known is not None:
         return known
     if letter.isascii():
@@ -94,13 +67,13 @@ def _letter(letter: str) -> str:
 def _greek(letter: str) -> str | None:
     script, _, name = unicodedata.name(letter, "").partition(" LETTER ")
     name = {"GREEK SMALL": name.lower(), "GREEK CAPITAL": name.capitalize()}.get(script, "")
-    return f"$\\{name}$" if name in _GREEK else None
+    return f"$\\{name}$" if name in _LATEX["greek"] else None
 
 
 def latex_unit(unit: str) -> str:
     """Return a unit with its powers raised; a dash where there is none."""
     text = unit_text(unit).replace("%", r"\%").replace("\N{EN DASH}", "--")
-    return text.replace("\N{DEGREE SIGN}", _SIGNS["\N{DEGREE SIGN}"])
+    return text.replace("\N{DEGREE SIGN}", _letter("\N{DEGREE SIGN}"))
 
 
 OWN = "calib"

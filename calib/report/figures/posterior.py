@@ -219,17 +219,7 @@ def ensembles_plate(result: OutputResult, reference: Reference = NOTHING) -> Pla
     style.legend_below(fig, handles, 3)
     r = draws.report
     worst, poorest = int(np.nanargmax(r.rhat)), int(np.nanargmin(r.ess_bulk))
-    said = caption(
-        "ensembles",
-        r=r,
-        ensembles=draws.t.shape[0],
-        walkers=draws.walkers,
-        rhat=r.rhat[worst],
-        worst=r.names[worst],
-        ess=r.ess_bulk[poorest],
-        poorest=r.names[poorest],
-        taus=float((r.steps / r.tau).min()),
-    )
+    said = caption("ensembles", draws=draws, r=r, worst=worst, poorest=poorest)
     return Plate(fig, "ensembles", said, "Convergence of the ensembles")
 
 
