@@ -214,6 +214,11 @@ def document(
     rows = {name: c.rows for name, c in candidates.items()}
     unsound = [name for name, c in candidates.items() if not c.sound]
     stated = stated_of_rows(rows, comparison.weights, unsound)
+    for name, c in candidates.items():
+        judged = c.loo if c.held is None else c.held
+        how: Any = {"emulator_fails": fails.get(name, ()), "held_out": hold_out}
+        said = verdict(c.calibration, judged, **how).document()
+        stated["models"][name] |= {**_model(c), "verdict": said}
     return {
         "schema": "calib/comparison/2",
         "seed": comparison.seed,
@@ -222,20 +227,6 @@ def document(
         **({"data_label": first.label} if first.label else {}),
         "converged": comparison.sound,
         **stated,
-        "models": {
-            name: {
-                **m,
-                **_model(candidates[name]),
-                "verdict": verdict(
-                    c.calibration,
-                    c.loo if c.held is None else c.held,
-                    emulator_fails=fails.get(name, ()),
-                    held_out=hold_out,
-                ).document(),
-            }
-            for name, m in stated["models"].items()
-            for c in [candidates[name]]
-        },
     }
 
 

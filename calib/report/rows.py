@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,21 +96,18 @@ def groups(result: Result, *, most: bool = True) -> list[Group]:
     """
     column = group_column(result)
     fitted, held = result.calibration.problem.table, held_table(result)
-    none = np.zeros(0, dtype=bool)
     if column is None:
         rows = np.ones(len(fitted), dtype=bool)
-        rest = none if held is None else np.ones(len(held), dtype=bool)
+        rest = np.ones(0 if held is None else len(held), dtype=bool)
         return [Group("", False, None, float("nan"), rows, rest)]
     axis = axis_of(column)
     inside, outside = fitted[column], np.empty(0) if held is None else held[column]
-    everything = np.concatenate([inside, outside])
     found = []
-    for low, high, value in _bins(everything):
+    for low, high, value in _bins(np.concatenate([inside, outside])):
         mine, theirs = ((v >= low) & (v <= high) for v in (inside, outside))
         only_held = bool(theirs.any() and not mine.any())
-        found.append(
-            Group(_title(axis, low, high, only_held), only_held, column, value, mine, theirs)
-        )
+        title = _title(axis, low, high, only_held)
+        found.append(Group(title, only_held, column, value, mine, theirs))
     return _kept(found) if most else found
 
 
@@ -143,29 +140,28 @@ def _title(axis: Axis, low: float, high: float, held: bool) -> str:
 
 
 def _bins(values: Array) -> list[tuple[float, float, float]]:
+    """Return lower end, upper end and middle of the groups of a condition."""
     distinct, counts = np.unique(values, return_counts=True)
-    if distinct.size <= 12 and counts.max() > 1:
-        return [(float(v), float(v), float(v)) for v in distinct]
-    if distinct.size <= 3:
-        return [(float(v), float(v), float(v)) for v in distinct]
+    if distinct.size <= 3 or (distinct.size <= 12 and counts.max() > 1):
+        return [(v, v, v) for v in distinct.tolist()]
     parts = np.array_split(np.sort(values), 3)
     return [(float(p[0]), float(p[-1]), float(np.median(p))) for p in parts]
 
 
 def grid(result: Result, group: Group) -> dict[str, Array]:
     """Conditions along the x axis of a panel, the others at the panel's middle."""
-    problem = result.calibration.problem
-    held = held_table(result)
+    fitted, held = result.calibration.problem.table, held_table(result)
     x = x_column(result)
-    everywhere = problem.table[x] if held is None else np.append(problem.table[x], held[x])
-    ends = min(0.0, float(everywhere.min())) if role_of(x) == "slip" else float(everywhere.min())
-    conditions: dict[str, Array] = {x: np.linspace(ends, float(everywhere.max()), 100)}
-    for name in problem.bound.model.conditions:
-        if name != x:
-            inside = problem.table[name][group.fitted]
-            outside = np.empty(0) if held is None else held[name][group.held_out]
-            conditions[name] = np.full(100, np.median(np.append(inside, outside)))
-    return conditions
+
+    def values(name: str, mine: Any = slice(None), theirs: Any = slice(None)) -> Array:
+        return np.append(fitted[name][mine], np.empty(0) if held is None else held[name][theirs])
+
+    everywhere = values(x)
+    low = min(0.0, everywhere.min()) if role_of(x) == "slip" else everywhere.min()
+    along = np.linspace(low, everywhere.max(), 100)
+    others = [n for n in result.calibration.problem.bound.model.conditions if n != x]
+    middles = {n: np.median(values(n, group.fitted, group.held_out)) for n in others}
+    return {x: along, **{name: np.full(100, middle) for name, middle in middles.items()}}
 
 
 # Of a diagnosis

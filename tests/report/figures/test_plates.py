@@ -19,8 +19,7 @@ from calib.report.figures.style import Plate, draw_all, style
 from calib.report.figures.validation import residuals_plate, validation_plate
 from calib.report.labels import axis_of, units_of
 from calib.report.rows import groups
-from calib.report.verdict import judge_evidence
-from calib.validation.scores import BOTH, DATA, MOVED, PRIOR, role_of, standardise
+from calib.validation.scores import BOTH, DATA, MOVED, PRIOR, role_of
 
 UNIT = re.compile(r"\(.+\)$")
 NAMES = ("bands", "validation", "prior_predictive", "learned", "corner", "ensembles", "residuals",
@@ -156,33 +155,6 @@ def test_captions_have_the_numbers(drawn, rut, density, unconverged):
 )  # fmt: skip
 def test_roles(ratio, moved, role):
     assert role_of(ratio, moved) == role
-
-
-def with_residuals(drawbar, high, low):
-    """Give the two calibrated pressures residuals of a known spread."""
-    problem = drawbar.calibration.problem
-    table = problem.table
-    rng = np.random.default_rng(5)
-    noise = np.where(table["inflation_pressure_psi"] < 30.0, high, low)
-    predicted = standardise(drawbar.calibration, problem).predicted
-    columns = dict(table.columns) | {
-        "drawbar_pull_kn": predicted + noise * rng.standard_normal(len(table))
-    }
-    told = problem.with_table(replace(table, columns=columns))
-    return replace(drawbar, calibration=replace(drawbar.calibration, problem=told))
-
-
-def test_scatter_that_differs_between_pressures_is_on_the_card(drawbar):
-    found = judge_evidence(with_residuals(drawbar, 0.2, 0.02).evidence)
-    (uneven,) = (remark for remark in found.remarks if remark.title == "Scatter is uneven")
-    assert "too narrow at 18 psi" in uneven.text
-    assert "too wide at 42 psi" in uneven.text
-    assert uneven.text in found.fails
-    assert found.trust.startswith("the median at 18 and 42 psi")
-    # Of two pressures each value is nearest to one.
-    assert all(uneven.concerns({"inflation_pressure_psi": np.array([p])}) for p in (10.0, 25.0))
-    same = judge_evidence(with_residuals(drawbar, 0.05, 0.05).evidence)
-    assert not any("too narrow" in text for text in same.fails)
 
 
 def test_many_pressures_are_cut_to_six_spread_out(drawbar):

@@ -109,10 +109,6 @@ def test_contents_lead_where_they_say(opened: Browser) -> None:
     assert 0 <= opened.run("return document.getElementById('last').getBoundingClientRect().top") < 9
 
 
-def test_a_page_without_faults_has_none(browser: Browser, tmp_path: Path) -> None:
-    assert faults(browser, written(tmp_path, f"<main>{BODY}</main>")) == []
-
-
 def test_faults_are_seen(browser: Browser, tmp_path: Path) -> None:
     found = "\n".join(faults(browser, written(tmp_path, BAD)))
     for what in (
