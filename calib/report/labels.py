@@ -76,6 +76,10 @@ class Axis:
         """For an axis."""
         return f"{self.name} ({self.unit})"
 
+    def titled(self, word: str) -> str:
+        """Return a label for values of some kind, such as predicted ones."""
+        return f"{word} {self.name.lower()} ({self.unit})"
+
     def scale(self, values: Array) -> Array:
         """Convert from the canonical unit."""
         return np.asarray(values) * self.factor

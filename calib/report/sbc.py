@@ -33,10 +33,7 @@ _TITLES: Mapping[str, str] = {
 def ranks_figure(model: ModelScore, adjusted: Mapping[tuple[str, str], float]) -> Figure:
     """Draw for each quantity the ECDF of its transforms less the uniform one, with its band.
 
-    Parameters
-    ----------
-    adjusted : mapping
-        Adjusted p values of the run, by model and quantity.
+    The p values of the run are adjusted, by model and quantity.
     """
     n = len(model.quantities)
     cols = 6 if n > 12 else min(5, n)

@@ -290,13 +290,8 @@ def kept_verdict(folder: Path) -> Verdict | None:
 def gather(calibration: Calibration, v: Validation | None, prior_predictive: Array) -> Evidence:
     """Collect the evidence of a calibration, in the units of its file.
 
-    Parameters
-    ----------
-    calibration : Calibration
-    v : Validation or None
-        How it did on rows that were not fitted, if there were any.
-    prior_predictive : ndarray, shape (draws, n)
-        Measurements that the priors expect at its rows.
+    The validation is on rows that were not fitted, if there were any; the measurements that the
+    priors expect at its rows have shape (draws, n).
     """
     result, problem = Fitted(calibration, v), calibration.problem
     model, parabolic = problem.bound.model, problem.bound.model.parabolic_in

@@ -306,6 +306,5 @@ def draw_predicted_observed(ax: Axes, result: OutputResult) -> dict[str, Any]:
     ends = [everything.min(), everything.max()]
     (handles["observed = predicted"],) = ax.plot(ends, ends, color=GREY, lw=0.9, ls=DASHES[2])
     ax.xaxis.set_major_locator(MaxNLocator(5))
-    name, unit = axis.name.lower(), axis.unit
-    ax.set(xlabel=f"Observed {name} ({unit})", ylabel=f"Predicted {name} ({unit})")
+    ax.set(xlabel=axis.titled("Observed"), ylabel=axis.titled("Predicted"))
     return handles

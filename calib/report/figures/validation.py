@@ -41,7 +41,7 @@ def residuals_plate(result: OutputResult, reference: Reference = NOTHING) -> Pla
         ]  # fmt: skip
         handles |= _scatter(ax, result, rows)
         ax.set_ylabel("Residual (noise sd)")
-    axes[0, 0].set_xlabel(f"Predicted {y_axis.name.lower()} ({y_axis.unit})")
+    axes[0, 0].set_xlabel(y_axis.titled("Predicted"))
     axes[0, 1].set_xlabel(x_axis.label)
     _quantiles(axes[1, 0], found[0][1].residual)
     handles |= _replicated(axes[1, 1], result)

@@ -27,17 +27,10 @@ TONE_MARKS = {
 
 
 def render_diagnosis(d: GapDocument) -> dict[str, bytes]:
-    """Render the files of a diagnosis from its document alone: page, figures, files for programs.
+    """Render the files of a diagnosis from its document alone, by name.
 
-    Parameters
-    ----------
-    d : GapDocument
-        From `calib.gap.document.load_document`, or of a diagnosis that was just made.
-
-    Returns
-    -------
-    dict of str to bytes
-        Files by name: ``index.html``, ``figures/*.png``, and those of `calib.gap.files.FILES`.
+    They are ``index.html``, ``figures/*.png``, and those for programs of `calib.gap.files.FILES`.
+    The document is from `calib.gap.document.load_document`, or of a diagnosis just made.
     """
     return {**_page_files(d), **program_files(d)}
 
@@ -64,12 +57,7 @@ def _page_files(d: GapDocument) -> dict[str, bytes]:
 def render_page(d: GapDocument, plates: Sequence[Plate], images: Mapping[str, bytes]) -> str:
     """Render the page, which makes no request: style and images are inside.
 
-    Parameters
-    ----------
-    d : GapDocument
-    plates : sequence of Plate
-    images : mapping of str to bytes
-        PNG files by the names of the plates.
+    Images are PNG files by the names of the plates.
     """
     with units_of(d.headers):
         words = Words(d)
