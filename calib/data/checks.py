@@ -22,10 +22,9 @@ type Array = NDArray[np.float64]
 
 # Levels up to which values are taken for a design's; test_checks, test_assumptions.
 FEW_LEVELS = 6
-# Factor beyond the usual values, and beyond calibrated ones, from which values that would fit in
-# another unit are refused: tyres of 3 psi are rare, tyres of 2 psi that would be usual in bar are
-# in bar; and a model is used beyond its range on purpose, by a factor; test_checks.
-FAR_FROM_USUAL, FAR_FROM_KNOWN = 2.0, 10.0
+# Factor beyond calibrated conditions from which values that would fit in another unit are refused:
+# a model is used beyond its range on purpose, by a factor; test_checks.
+FAR_FROM_KNOWN = 10.0
 # Dimensions of which small wheels have less than vehicles' wheels.
 OF_SMALL_WHEELS = ("force", "torque")
 
@@ -72,7 +71,8 @@ def check_units(table: Table, names: Iterable[str]) -> None:
         values = table[name][np.isfinite(table[name])]
         if usual is None or not values.size or table.column(name).checked:
             continue
-        low, high = usual[0] / FAR_FROM_USUAL, usual[1] * FAR_FROM_USUAL
+        # Tyres of 3 psi are rare, tyres of 2 psi that would be usual in bar are in bar.
+        low, high = usual[0] / 2.0, usual[1] * 2.0
         far = bool((values < low).all() or (values > high).all())
         # Asked last, for the rarer units are pint's, which takes longer to start than a diagnosis.
         read = usual_in(table, name, values, *usual) if far else ""

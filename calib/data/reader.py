@@ -88,7 +88,7 @@ def said_of(label: str) -> str:
     return re.sub(r" ?\[@[^]]*\]", "", " ".join(known))
 
 
-class Problem(NamedTuple):
+class Fault(NamedTuple):
     """Something wrong in a table; an empty column stands for the whole row."""
 
     line: int
@@ -98,12 +98,12 @@ class Problem(NamedTuple):
     hint: str
 
 
-def _raise_any(problems: Sequence[Problem], source: str, place: str = "line") -> None:
+def _raise_any(problems: Sequence[Fault], source: str, place: str = "line") -> None:
     """Raise the first problems in the order of the lines, and the number of all, if any."""
     if not problems:
         return
 
-    def at(problem: Problem) -> str:
+    def at(problem: Fault) -> str:
         column = f", column {problem.column!r}" if problem.column else ""
         return f"{place} {problem.line}{column}"
 
@@ -157,17 +157,17 @@ class _Values:
         with np.errstate(over="ignore"):
             return self.column.to_canonical(self.written)
 
-    def problem(self, i: int, found: str, hint: str, expected: str = "") -> Problem:
+    def problem(self, i: int, found: str, hint: str, expected: str = "") -> Fault:
         expected = expected or self.column.expected
-        return Problem(int(self.lines[i]), self.column.header, found, expected, hint)
+        return Fault(int(self.lines[i]), self.column.header, found, expected, hint)
 
-    def problems(self) -> Iterator[Problem]:
+    def problems(self) -> Iterator[Fault]:
         yield from _impossible(self)
         if self.used:
             yield from _codes(self)
 
 
-def _impossible(of: _Values) -> Iterator[Problem]:
+def _impossible(of: _Values) -> Iterator[Fault]:
     """Values that are not finite, too large for a reading or outside the quantity's range."""
     quantity = of.column.quantity
     # Squares and cubes of larger numbers leave the range of double precision.
@@ -222,7 +222,7 @@ def _is_code(written: Array) -> NDArray[np.bool_]:
     return np.isin(np.round(written, 6), [*np.negative(nines), *large, -999.25, -32768.0])
 
 
-def _codes(of: _Values) -> Iterator[Problem]:
+def _codes(of: _Values) -> Iterator[Fault]:
     """Codes for missing values among values that can be readings.
 
     A code is taken for a reading if it is no farther from the other values than these are from one
@@ -251,7 +251,7 @@ def _codes(of: _Values) -> Iterator[Problem]:
 
 def _decimal_signs(
     columns: Sequence[tuple[str, Sequence[str]]], lines: Sequence[int]
-) -> list[Problem]:
+) -> list[Fault]:
     """Decimal commas beside decimal points, or commas that may all separate thousands."""
     found: dict[str, list[tuple[int, str, str]]] = {
         sign: [
@@ -270,17 +270,17 @@ def _decimal_signs(
         at, name, other = found["."][0]
         said = f"{other!r} in line {at}, column {name!r} has a decimal point"
         said = f"{cell!r} has a decimal comma, but {said}"
-        return [Problem(line, column, said, "one decimal sign in the whole file", hint)]
+        return [Fault(line, column, said, "one decimal sign in the whole file", hint)]
     if all(re.fullmatch(r"[-+]?[1-9]\d{0,2},\d{3}", text.strip()) for _, _, text in found[","]):
         said = f"{cell!r} may be {cell.replace(',', '')} or {cell.replace(',', '.')}"
         said += ", and no comma of the file tells which"
-        return [Problem(line, column, said, "numbers of one reading", hint)]
+        return [Fault(line, column, said, "numbers of one reading", hint)]
     return []
 
 
 def _labels(
     column: Column, cells: Sequence[str], lines: Sequence[int], missing_ok: bool
-) -> tuple[Array, list[Problem]]:
+) -> tuple[Array, list[Fault]]:
     """Turn labels into numbers.
 
     Whole numbers stay as they are; otherwise the codes count the sorted labels from 0, so that
@@ -289,7 +289,7 @@ def _labels(
     labels = [cell.strip() for cell in cells]
     empty = np.array([not label for label in labels], dtype=np.bool_)
     problems = [
-        Problem(int(lines[i]), column.header, "an empty cell", "any label", "fill in the label")
+        Fault(int(lines[i]), column.header, "an empty cell", "any label", "fill in the label")
         for i in ([] if missing_ok else np.flatnonzero(empty).tolist())
     ]
     try:
@@ -309,7 +309,7 @@ def _checked(
     required: Sequence[str],
     allow_missing: Collection[str],
     decimal_comma: bool = False,
-) -> tuple[dict[str, Array], list[Problem]]:
+) -> tuple[dict[str, Array], list[Fault]]:
     """Return the canonical values of columns, of cells or numbers, and what is wrong with them."""
     values, problems = {}, []
     for column in columns:
@@ -399,7 +399,7 @@ def read_table(
     return _labelled(table, ignored)
 
 
-def _ragged(file: CsvFile) -> Iterator[Problem]:
+def _ragged(file: CsvFile) -> Iterator[Fault]:
     """Rows of more or fewer cells than there are column names."""
     width = len(file.header)
     hint = "complete the row, or delete the cells too many"
@@ -408,7 +408,7 @@ def _ragged(file: CsvFile) -> Iterator[Problem]:
     for line, row in file.rows:
         if len(row) != width:
             found = f"the row has {len(row)} cells, the line of column names {width}"
-            yield Problem(line, "", found, f"{width} cells", hint)
+            yield Fault(line, "", found, f"{width} cells", hint)
 
 
 def read_for_model(path: str | os.PathLike[str], used: Sequence[str]) -> Table:

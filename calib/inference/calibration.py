@@ -77,7 +77,8 @@ class Calibration:
     @cached_property
     def natural(self) -> Array:
         """Draws of all natural parameters, sigma last, shape (chains, draws, d_all)."""
-        return _by_walker(self.problem.theta(self.draws.flat), self.draws)
+        ensembles, walkers, steps, _ = self.draws.t.shape
+        return self.problem.theta(self.draws.flat).reshape(ensembles * walkers, steps, -1)
 
     @cached_property
     def reported(self) -> Mapping[str, Array]:
@@ -106,33 +107,36 @@ class Calibration:
         return np.asarray(flat[picked])
 
 
-def _by_walker(flat: Array, draws: Draws) -> Array:
-    ensembles, walkers, steps, _ = draws.t.shape
-    return flat.reshape(ensembles * walkers, steps, flat.shape[-1])
-
-
 def _summarise(calibration: Calibration) -> dict[str, ParameterSummary]:
     problem = calibration.problem
     units = {**problem.bound.model.reported, **{p.name: p.unit for p in problem.priors.entries}}
     names = tuple(calibration.parameters)
     stacked = np.stack([calibration.parameters[name] for name in names], axis=-1)
     ensembles, walkers, steps, _ = calibration.draws.t.shape
-    found = convergence(stacked.reshape(ensembles, walkers, steps, -1))
+    rhat, bulk, tail = convergence(stacked.reshape(ensembles, walkers, steps, -1))
     mean_ess = ess(stacked, "mean")
     flat = stacked.reshape(-1, len(names))
-    batches = _batches(stacked.reshape(ensembles, walkers, steps, -1))
-    interval_error = [hdi_error(batches[j], 0.95) for j in range(len(names))]
-    prior_sd = _prior_sds(calibration)
+    # Consecutive parts of every ensemble are nearly independent.
+    parts = max(1, min(4, steps // 2))
+    kept = stacked.reshape(ensembles, walkers, steps, -1)[:, :, : parts * (steps // parts)]
+    batches = kept.reshape(ensembles, walkers, parts, -1, len(names)).transpose(4, 0, 2, 1, 3)
+    batches = batches.reshape(len(names), ensembles * parts, -1)
+    interval_error = [hdi_error(each, 0.95) for each in batches]
+    # Sds in internal coordinates, where a log-normal's is finite and meaningful.
+    priors, levels = problem.priors, (np.arange(999) + 0.5) / 999.0
+    prior = priors.ppf(levels[:, None] * np.ones(len(priors.free)))
+    ratios = calibration.draws.flat.std(axis=0) / prior.std(axis=0)
+    sd_ratio = dict(zip(problem.names, ratios.tolist(), strict=True))
     return {
         name: ParameterSummary(
             name=name,
             unit=units[name],
             **moments(flat[:, j]),
-            ess_bulk=float(found.ess_bulk[j]),
-            ess_tail=float(found.ess_tail[j]),
-            rhat=float(found.rhat[j]),
+            ess_bulk=float(bulk[j]),
+            ess_tail=float(tail[j]),
+            rhat=float(rhat[j]),
             mcse_mean=float(flat[:, j].std(ddof=1) / np.sqrt(mean_ess[j])),
-            sd_ratio=_internal_sd(calibration, name) / prior_sd.get(name, np.nan),
+            sd_ratio=sd_ratio.get(name, np.nan),
             mcse_median=median_error(batches[j]),
             mcse_hdi_lower=float(interval_error[j][0]),
             mcse_hdi_upper=float(interval_error[j][1]),
@@ -151,28 +155,6 @@ def moments(draws: Array) -> dict[str, float]:
         "hdi_lower": low,
         "hdi_upper": high,
     }
-
-
-def _batches(draws: Array) -> Array:
-    """Draws (ensembles, walkers, steps, d) in consecutive parts of every ensemble, (d, g, m)."""
-    ensembles, walkers, steps, d = draws.shape
-    parts = max(1, min(4, steps // 2))
-    kept = draws[:, :, : parts * (steps // parts)].reshape(ensembles, walkers, parts, -1, d)
-    return np.asarray(kept.transpose(4, 0, 2, 1, 3).reshape(d, ensembles * parts, -1))
-
-
-def _prior_sds(calibration: Calibration) -> dict[str, float]:
-    """Prior sd in internal coordinates, where a log-normal's is finite and meaningful."""
-    priors = calibration.problem.priors
-    drawn = priors.ppf(((np.arange(999) + 0.5) / 999.0)[:, None] * np.ones(len(priors.free)))
-    return {p.name: float(drawn[:, j].std()) for j, p in enumerate(priors.free)}
-
-
-def _internal_sd(calibration: Calibration, name: str) -> float:
-    names = calibration.problem.names
-    if name not in names:
-        return float("nan")
-    return float(calibration.draws.flat[:, names.index(name)].std())
 
 
 def calibrate(

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calib.data.files import plain_number
 from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
-from calib.inference.constants import MOST_NODES, OTHER_UNIT, PATIENCE, SAME_OUTPUT
+from calib.inference.constants import PATIENCE, SAME_OUTPUT
 from calib.inference.problem import Problem
 from calib.inference.random import generator
 from calib.models.base import Array
@@ -74,7 +74,7 @@ def try_simulator(problem: Problem) -> None:
         return
     spread = prior_design(problem, FIRST_RUNS, 0)
     thetas = np.concatenate([prior_middle(problem), spread])
-    with _told_if_long(direct.simulator):
+    with _warned_if_long(direct.simulator):
         direct.try_first(thetas, problem.conditions)
         outputs = problem.bound.predict(thetas, problem.conditions)
     check_scale(problem, outputs, direct.simulator)
@@ -85,7 +85,7 @@ def try_simulator(problem: Problem) -> None:
 
 
 @contextmanager
-def _told_if_long(simulator: Simulator) -> Iterator[None]:
+def _warned_if_long(simulator: Simulator) -> Iterator[None]:
     """Say what is waited for if it is not over soon."""
     timer = Timer(
         PATIENCE, _log.warning,
@@ -165,7 +165,7 @@ def check_scale(problem: Problem, outputs: Array, simulator: Simulator) -> None:
     if not values.size:
         return
     times = values.max(axis=1) / np.abs(problem.observed).max()
-    if times.max() > 1.0 / OTHER_UNIT and times.min() < OTHER_UNIT:
+    if times.max() > 1.0 / 30.0 and times.min() < 30.0:  # kN and N differ by 1000
         return
     output = problem.bound.model.output
     header = next(o.header for o in simulator.outputs if simulator.canonical(o.header) == output)
@@ -209,7 +209,7 @@ def choose_nodes(
     varying = high > low
     unit = np.where(varying, high - low, 1.0)
     inside = (rows - low) / unit
-    most = count or MOST_NODES
+    most = count or 160
     if len(inside) > most:
         inside = inside[_spread(inside, np.zeros((0, len(columns))), most)]
     # A curve is smooth, a surface needs more nodes.

@@ -22,18 +22,10 @@ def _stats() -> Any:
     return base.array_stats
 
 
-@dataclass(frozen=True)
-class Convergence:
-    """Rank-normalised split R-hat, bulk and tail ESS of each parameter, shape (d,) each."""
+def convergence(draws: Array) -> tuple[Array, Array, Array]:
+    """Return rank-normalised split R-hat, bulk and tail ESS of each parameter, shape (d,) each.
 
-    rhat: Array
-    ess_bulk: Array
-    ess_tail: Array
-
-
-def convergence(draws: Array) -> Convergence:
-    """Judge draws of ensembles, shape (ensembles, walkers, steps, d); NaN of fewer than four steps.
-
+    Of draws of ensembles, (ensembles, walkers, steps, d); NaN of fewer than four steps.
     Walkers of one ensemble are not independent chains, so R-hat compares whole ensembles: each is
     one chain, its halves the earlier and the later steps. Effective sample sizes take each walker
     as a chain, for autocorrelation runs along its steps.
@@ -44,12 +36,12 @@ def convergence(draws: Array) -> Convergence:
     """
     ensembles, walkers, steps, d = draws.shape
     if steps < 4:
-        return Convergence(*np.full((3, d), np.nan))
+        return np.full(d, np.nan), np.full(d, np.nan), np.full(d, np.nan)
     by_step = draws[:, :, steps % 2 :].swapaxes(1, 2).reshape(ensembles, -1, d)
     chains = draws.reshape(ensembles * walkers, steps, d)
     with np.errstate(all="ignore"):
         rhat = np.asarray(_stats().rhat(by_step, method="rank", **_AXES))
-    return Convergence(rhat, ess(chains, "bulk"), ess(chains, "tail"))
+    return rhat, ess(chains, "bulk"), ess(chains, "tail")
 
 
 def longest_autocorrelation_time(chain: Array) -> Array:
@@ -236,8 +228,7 @@ def judge(
     """
     ensembles = draws.shape[0]
     steps = draws.shape[2] if steps is None else steps
-    found = convergence(draws)
-    r, bulk, tail = found.rhat, found.ess_bulk, found.ess_tail
+    r, bulk, tail = convergence(draws)
     reasons = []
     if ensembles < min_ensembles:
         reasons.append(f"{ensembles} ensembles, at least {min_ensembles} are needed")

@@ -33,7 +33,6 @@ from calib.batch.environment import Environment, differs_in_lines, sha256
 from calib.data import read_for_model, write_table
 from calib.errors import CalibError, in_words
 from calib.inference.calibration import Calibration, calibrate
-from calib.inference.constants import MAX_CELLS
 from calib.inference.diagnostics import GateReport
 from calib.inference.estimators import PointEstimate, estimate
 from calib.inference.likelihood import noise_of
@@ -197,8 +196,8 @@ def to_datatree(calibration: Calibration) -> xr.DataTree:
     problem, draws = calibration.problem, calibration.draws
     chains, steps = calibration.natural.shape[:2]
     output = problem.bound.model.output
-    # Of long data the groups that hold a number for every draw and row hold fewer draws, or none.
-    kept = min(steps, MAX_CELLS // (chains * problem.response.size))
+    # Groups with a number for every draw and row have 64 MB at most: of long data fewer draws.
+    kept = min(steps, 8_000_000 // (chains * problem.response.size))
     picked = np.linspace(0, steps - 1, kept).round().astype(int)
     shape = (chains, kept, problem.response.size)
     by_row: dict[str, Mapping[str, NDArray[Any]]] = {}
@@ -354,10 +353,7 @@ def save_calibration(
     problem = calibration.problem
     save_posterior(calibration, folder / POSTERIOR)
     (folder / PRIORS).write_text(problem.priors.text, encoding="utf-8")
-    write_table(
-        folder / DATA,
-        {**problem.table.to_write(problem.table.columns), **problem.table.extra},
-    )
+    write_table(folder / DATA, problem.table.whole())
     hashed = [POSTERIOR, PRIORS, DATA]
     emulator = emulator_of(problem.bound.model)
     if emulator is not None:

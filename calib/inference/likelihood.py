@@ -287,7 +287,8 @@ class Serial:
     order : ndarray of int, shape (n,)
         Rows of the table, run by run.
     gap : ndarray, shape (n,)
-        How far each of these is from the one before; infinite for the first of a run.
+        How far each of these is from the one before, with which it has the correlation rho to this
+        power; infinite for the first of a run.
     """
 
     order: NDArray[np.intp]
@@ -301,14 +302,14 @@ class Serial:
         z : ndarray, shape (k, n)
         rho : ndarray, shape (k, 1)
         """
-        r, along = self._correlations(rho), z[:, self.order]
+        r, along = rho**self.gap, z[:, self.order]
         mean = np.zeros_like(along)
         mean[:, 1:] = r[:, 1:] * along[:, :-1]
         return self._back(mean), self._back(1.0 - r * r)
 
     def given_all_others(self, z: Array, rho: Array) -> tuple[Array, Array]:
         """Mean and variance of each row given all others, (k, n), in the rows' order."""
-        r, along = self._correlations(rho), z[:, self.order]
+        r, along = rho**self.gap, z[:, self.order]
         after = np.column_stack([r[:, 1:], np.zeros(len(r))])
         left, right = 1.0 - r * r, 1.0 - after * after
         precision = 1.0 / left + after * after / right
@@ -319,15 +320,11 @@ class Serial:
 
     def correlate(self, z: Array, rho: Array) -> Array:
         """Turn independent standard normals (k, n) into noise that is correlated."""
-        r, along = self._correlations(rho), z[:, self.order]
+        r, along = rho**self.gap, z[:, self.order]
         for i in range(1, along.shape[1]):
             own = np.sqrt(1.0 - r[:, i] ** 2)
             along[:, i] = r[:, i] * along[:, i - 1] + own * along[:, i]
         return self._back(along)
-
-    def _correlations(self, rho: Array) -> Array:
-        """Correlation of each row with the one before, (k, n)."""
-        return np.asarray(rho**self.gap)
 
     def _back(self, along: Array) -> Array:
         out = np.empty_like(along)

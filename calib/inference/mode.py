@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from calib.inference.constants import MODE_STARTS, NEGLIGIBLE_NATS, SAME_MODE
 from calib.inference.priors import Priors
 from calib.inference.random import even_points
 from calib.models.base import Array
@@ -132,12 +131,12 @@ class Mode:
         """
         apart = t - self.t
         squared = float(apart @ np.linalg.solve(self.covariance, apart))
-        return squared < 4.0 * max(self.log_prob - log_prob, 0.0) + SAME_MODE
+        return squared < 4.0 * max(self.log_prob - log_prob, 0.0) + 25.0
 
 
 def find_modes(
     log_prob: LogProb, priors: Priors, rng: np.random.Generator, *,
-    starts: Array | None = None, spread: int = MODE_STARTS,
+    starts: Array | None = None, spread: int = 64,
 ) -> list[Mode]:  # fmt: skip
     """Return the modes of a posterior ``(k, d) -> (k,)`` that were found, the highest first.
 
@@ -155,9 +154,10 @@ def find_modes(
     if not np.isfinite(values).any():  # the caller will see
         return [Mode(ends[0], -np.inf, np.diag(width**2))]
     modes: list[Mode] = []
+    negligible = 15.0  # nats below the highest mode, where no mass is
     for i in np.argsort(-values):
         t, value = ends[i], float(values[i])
-        if values.max() - value > NEGLIGIBLE_NATS or any(m.explains(t, value) for m in modes):
+        if values.max() - value > negligible or any(m.explains(t, value) for m in modes):
             continue
         # A posterior may be a million times narrower than its prior.
         near = np.sqrt(np.diag(hessian_scale(log_prob, t, width)))

@@ -177,22 +177,17 @@ class Priors:
         """Return all parameters, fixed ones included, shape (k, d) to (k, d_all)."""
         t = np.atleast_2d(t)
         fixed, free, logs = self._layout
-        if free is None:
-            full = t.copy()
-        else:
-            full = np.tile(fixed, (t.shape[0], 1))
-            full[:, free] = t
-        if logs is not None:
-            full[:, logs] = np.exp(np.minimum(full[:, logs], 700.0))
+        full = np.tile(fixed, (len(t), 1))
+        full[:, free] = t
+        full[:, logs] = np.exp(np.minimum(full[:, logs], 700.0))
         return full
 
     @cached_property
-    def _layout(self) -> tuple[Array, Mask | None, Mask | None]:
-        """Values of the fixed parameters, which are free (None: all), which on a log scale."""
-        fixed = np.array([p.loc for p in self.entries])
+    def _layout(self) -> tuple[Array, Mask, Mask]:
+        """Values of the fixed parameters, which are free, and which on a log scale."""
         free = np.array([not p.fixed for p in self.entries])
         logs = np.array([p.log and not p.fixed for p in self.entries])
-        return fixed, None if free.all() else free, logs if logs.any() else None
+        return np.array([p.loc for p in self.entries]), free, logs
 
     def to_internal(self, natural: Array, margin: float = 1e-9) -> Array:
         """Map all natural parameters, shape (k, d_all), inside the bounds, shape (k, d)."""
@@ -214,20 +209,16 @@ class Priors:
                 where=self.source,
                 expected=", ".join(p.name for p in self.entries),
             )
-        return Priors(
-            tuple(
-                Prior(
-                    p.name, p.unit, "held fixed for this fit", "this call", f"fixed at "
-                    f"{values[p.name]:g}", False, float(values[p.name]), 0.0,
-                )
-                if p.name in values
-                else p
-                for p in self.entries
-            ),
-            self.text,
-            self.source,
-            self.noise,
-        )  # fmt: skip
+        units = {p.name: p.unit for p in self.entries}
+        held = {
+            name: Prior(
+                name, units[name], "held fixed for this fit", "this call", f"fixed at {value:g}",
+                False, float(value), 0.0,
+            )
+            for name, value in values.items()
+        }  # fmt: skip
+        entries = tuple(held.get(p.name, p) for p in self.entries)
+        return Priors(entries, self.text, self.source, self.noise)
 
 
 @dataclass(frozen=True)

@@ -17,14 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln, logsumexp
 
-from calib.inference.constants import (
-    BROAD_SHARE,
-    FITTED_DRAWS,
-    GOOD_EFFICIENCY,
-    MOST_COMPONENTS,
-    ROUND_SIZES,
-    WIDENING,
-)
+from calib.inference.constants import ROUND_SIZES
 from calib.models.base import Array
 
 type LogProb = Callable[[Array], Array]
@@ -212,7 +205,7 @@ def fit_mixture(
     draws as there are dimensions.
     """
     k, d = x.shape
-    m = int(np.clip(effective / (5.0 * d**2), 1, MOST_COMPONENTS))
+    m = int(np.clip(effective / (5.0 * d**2), 1, 6))
     whole = np.cov(x.T, aweights=weight, ddof=0).reshape(d, d)
     centres = x[rng.choice(k, size=m, p=weight)] if m > 1 else weight @ x[None]
     factor = (0.7 if m > 1 else 1.0) * np.linalg.cholesky(whole)
@@ -236,7 +229,8 @@ def fit_mixture(
             for (mean, covariance), keep in zip(updated, kept, strict=True)
             if keep
         ]
-    return shares, tuple(StudentT(p.mean, WIDENING * p.cholesky, p.dof) for p in parts)
+    # A little wider: in importance weights light tails cost more than heavy ones.
+    return shares, tuple(StudentT(p.mean, 1.07 * p.cholesky, p.dof) for p in parts)
 
 
 @dataclass(frozen=True)
@@ -274,8 +268,7 @@ class Part:
         straight = moments(v, weight)
         if straight is None:
             return self
-        least, most = BROAD_SHARE
-        share = least + (most - least) * (1.0 - trust) ** 2
+        share = 0.08 + 0.32 * (1.0 - trust) ** 2
         shares, components = fit_mixture(v, weight, effective, rng)
         broad = StudentT(straight[0], 1.3 * straight[1], 4.0)
         return Part(np.append((1.0 - share) * shares, share), (*components, broad), found)
@@ -325,9 +318,10 @@ class Proposal:
         proportion to the probability that it proposed them. A mode that seems to have no mass is
         proposed once in a hundred all the same.
         """
-        if weight.size > FITTED_DRAWS:
-            draws = draws[systematic(weight, FITTED_DRAWS, rng)]
-            weight = np.full(FITTED_DRAWS, 1.0 / FITTED_DRAWS)
+        enough = 4000  # draws; a fit to more is no better
+        if weight.size > enough:
+            draws = draws[systematic(weight, enough, rng)]
+            weight = np.full(enough, 1.0 / enough)
         logs = self._log_parts(draws)
         by_part = np.exp(logs - log_sum(logs)) * weight
         mass = np.maximum(by_part.sum(axis=1), 1e-300)
@@ -393,7 +387,8 @@ def adapt(
         draws, log_q = proposal.draw(rng, size * (d + 5) * len(guesses))
         value = log_prob(draws)
         found = _assess(value - log_q)
-        if found.efficiency > GOOD_EFFICIENCY or found.efficiency == 0.0:
+        # Above 0.9 a better proposal is not worth a round.
+        if found.efficiency > 0.9 or found.efficiency == 0.0:
             break
         rounds.append((proposal, len(draws)))
         draws, value = draws[np.isfinite(value)], value[np.isfinite(value)]

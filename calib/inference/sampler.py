@@ -20,14 +20,7 @@ from scipy.special import logsumexp
 
 from calib.batch.environment import one_thread
 from calib.errors import CalibError
-from calib.inference.constants import (
-    ANNEALED,
-    JUDGED,
-    LEAST_LONGER,
-    LEAST_STEPS,
-    LONG_DATA,
-    PROPOSED,
-)
+from calib.inference.constants import JUDGED, PROPOSED
 from calib.inference.design import try_simulator
 from calib.inference.diagnostics import (
     LEAST_ENSEMBLES,
@@ -162,7 +155,7 @@ def sample_posterior(
     chosen = settings or SamplerSettings()
     if chosen.walkers is None:
         # Where an evaluation is dear, fewer walkers are run.
-        long, dear = problem.squares.mean.size > LONG_DATA, model.slow or model.uncertain
+        long, dear = problem.squares.mean.size > 5000, model.slow or model.uncertain
         few = 20 if long else 64 if dear else 320
         chosen = replace(chosen, walkers=max(few, 2 * (d + 1)))
     walkers = chosen.n_walkers(d)
@@ -175,7 +168,7 @@ def sample_posterior(
     count_rough = count if rough is problem else _Counter(rough.log_prob)
     annealed = None
     if chosen.ensembles >= LEAST_ENSEMBLES:
-        drawn = priors.sample(rng, max(ANNEALED, walkers))
+        drawn = priors.sample(rng, max(512, walkers))
         annealed = anneal(priors.log_prob, count_rough, drawn, rng)
         if annealed is not None and rough is not problem:
             some = annealed[rng.permutation(len(annealed))[:walkers]]
@@ -196,9 +189,8 @@ def sample_posterior(
     draws = sample_density(
         count, _guesses(modes, annealed), seeds, problem.names, chosen, rng=rng,
         last_starts=None if annealed is None else annealed[:walkers], progress=progress,
-        began=began,
     )  # fmt: skip
-    draws = replace(draws, mode=modes[0].t)
+    draws = replace(draws, mode=modes[0].t, seconds=time.perf_counter() - began)
     if not isinstance(priors, SumAndRatio):
         return draws
     # Back in the coordinates of the parameters, draws are judged as well.
@@ -268,7 +260,6 @@ def sample_density(
     rng: np.random.Generator,
     last_starts: Array | None = None,
     progress: Progress | None = None,
-    began: float | None = None,
 ) -> Draws:
     """Sample any unnormalised density ``(k, d) -> (k,)`` from first guesses, the best first.
 
@@ -278,10 +269,8 @@ def sample_density(
         One for the adaptation (already used by `rng`) and one for each ensemble.
     last_starts : ndarray, shape (walkers, d), optional
         Where the last ensemble starts; like the others, at draws from the proposal by default.
-    began : float, optional
-        ``time.perf_counter()`` at which the work began.
     """
-    began = time.perf_counter() if began is None else began
+    began = time.perf_counter()
     count = log_prob if isinstance(log_prob, _Counter) else _Counter(log_prob)
     walkers = settings.n_walkers(first[0].mean.size)
     proposal, found = adapt(count, first, rng)
@@ -294,13 +283,13 @@ def sample_density(
     segments: list[list[tuple[Array, Array]]] = [[] for _ in streams]
     while True:
         made = sum(len(value) for _, value in segments[0])
-        aside = 0 if made else max(16, target // 12)  # the first steps are not kept
-        length, accepted = target - made + aside, []
+        burn_in = 0 if made else max(16, target // 12)
+        length, accepted = target - made + burn_in, []
         for i, stream in enumerate(streams):
             moves = fitted_moves(proposal, stream)
             chain, value, fraction = run_walkers(count, starts[i], moves, length, stream)
             starts[i] = chain[-1]
-            segments[i].append((chain[aside:], value[aside:]))
+            segments[i].append((chain[burn_in:], value[burn_in:]))
             accepted.append(fraction)
             if progress is not None:
                 progress(done + (i + 1) * length, done + len(streams) * length)
@@ -318,7 +307,7 @@ def sample_density(
         if neglected.any():
             what = f"{neglected.mean():.1%} of the draws lie where hardly any was proposed"
             report = replace(report, passed=False, reasons=(*report.reasons, what))
-        if report.passed or LEAST_LONGER * target > settings.max_steps:
+        if report.passed or 1.25 * target > settings.max_steps:
             break
         had, target = target, min(_longer(target, tau, report, settings.gate), settings.max_steps)
         if target <= 2 * had and not neglected.any():
@@ -351,7 +340,7 @@ def _longer(steps: int, tau: Array, report: GateReport, gate: Gate) -> int:
     short = np.concatenate([gate.taus_min * tau / steps, gate.ess_min / ess])
     known = short[np.isfinite(short)]
     needed = 1.2 * float(known.max(initial=0.0))
-    return int(steps * (np.clip(needed, LEAST_LONGER, 4.0) if needed > 1.2 else 2.0))
+    return int(steps * (np.clip(needed, 1.25, 4.0) if needed > 1.2 else 2.0))
 
 
 def _start(log_prob: LogProb, proposal: Proposal, walkers: int, rng: np.random.Generator) -> Array:
@@ -377,7 +366,7 @@ def _thinned(t: Array, log_prob: Array, draws: int) -> tuple[Array, Array]:
     Shape (ensembles, steps, walkers, d) to (ensembles, walkers, kept, d), and their log densities.
     """
     _, steps, walkers, _ = t.shape
-    kept = min(steps, max(LEAST_STEPS, draws // walkers))
+    kept = min(steps, max(32, draws // walkers))  # of fewer, ESS comes out a tenth too large
     few = min(walkers, max(1, draws // kept))
     at = np.linspace(0, steps - 1, kept).round().astype(np.intp)
     who = np.linspace(0, walkers - 1, few).round().astype(np.intp)[:, None]

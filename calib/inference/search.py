@@ -20,7 +20,6 @@ from scipy.linalg import qr
 
 from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
-from calib.inference.constants import FLAT_PART, SHORT_DATA
 from calib.inference.mode import prior_widths
 from calib.inference.problem import Problem
 from calib.models.base import Array, BoundModel, Conditions
@@ -139,11 +138,11 @@ def representative_rows(problem: Problem) -> Problem:
 
     They are enough to find the neighbourhood of the optimum.
     """
-    n = len(problem.table)
-    if n <= SHORT_DATA:
+    n, enough = len(problem.table), 4000
+    if n <= enough:
         return problem
     conditions = list(problem.conditions.values())
-    pick = np.linspace(0, n - 1, SHORT_DATA // len(conditions)).round().astype(int)
+    pick = np.linspace(0, n - 1, enough // len(conditions)).round().astype(int)
     rows = np.unique(np.concatenate([np.argsort(c, kind="stable")[pick] for c in conditions]))
     return problem.with_table(problem.table.take(rows))
 
@@ -184,7 +183,7 @@ def _flat_at_points(problem: Problem) -> list[tuple[int, ...]]:
         jacobian = ((behind - ahead) / 2e-4).T  # per prior standard deviation
         if np.isfinite(jacobian).all():
             upper, order = qr(jacobian, mode="r", pivoting=True, check_finite=False)
-            left = np.abs(np.diagonal(upper)) > FLAT_PART * max(scatter, 1e-300)
+            left = np.abs(np.diagonal(upper)) > 1e-6 * max(scatter, 1e-300)
             found.append(tuple(int(j) for j in order[np.count_nonzero(left) :]))
     return found
 
@@ -192,13 +191,14 @@ def _flat_at_points(problem: Problem) -> list[tuple[int, ...]]:
 type Box = Mapping[str, tuple[float, float]]
 
 
-class Found(NamedTuple):
+class Minimum(NamedTuple):
     """What a minimiser found: where, after how many evaluations, and whether it had converged."""
 
     x: Array
     n_evaluations: int
     converged: bool
     note: str = ""
+    cost: float = np.nan
 
 
 @dataclass(frozen=True)
@@ -232,27 +232,62 @@ class SearchSpace:
         """Sum of squared residuals (Eq 10), (k, d) to (k,); ``inf`` where there is no value."""
         return sum_of_squares(self.problem, self.natural(x))
 
-    def _residuals(self, x: Array) -> Array:
-        return np.asarray(self.problem.residuals(self.natural(x[None]))[0])
-
-    def polish(self, x: Array) -> Found:
+    def polish(self, x: Array) -> Minimum:
         """Descend from a point of the box (d,) by least squares; never to a higher cost."""
-        # Imported late: it takes a tenth of a second.
-        from scipy.optimize import least_squares
+        found = descend(
+            lambda x: self.problem.residuals(self.natural(x)), x, self.lower, self.upper,
+            self.upper - self.lower, scatter_of(self.problem),
+        )  # fmt: skip
+        better = found.cost <= self.cost(x[None])[0]
+        return Minimum(found.x if better else x, found.n_evaluations, found.converged)
 
-        result = least_squares(
-            self._residuals,
-            x,
-            jac="3-point",
-            bounds=(self.lower, self.upper),
-            x_scale=self.upper - self.lower,
-            ftol=1e-13,
-            xtol=1e-13,
-            gtol=1e-13,
-        )
-        n_evaluations = result.nfev + 2 * x.size * (result.njev or 0)
-        better = 2.0 * result.cost <= self.cost(x[None])[0]
-        return Found(np.asarray(result.x) if better else x, n_evaluations, bool(result.success))
+
+def descend(
+    residuals: Callable[[Array], Array], x: Array, lower: Array, upper: Array, width: Array,
+    scale: float,
+) -> Minimum:  # fmt: skip
+    """Descend from a point (d,) within bounds by SciPy's trust-region reflective least squares.
+
+    `residuals` are (k, d) to (k, n), of the order of `scale`; each coordinate matters over its
+    `width`. All differences of the Jacobian are one evaluation, one-sided on a bound.
+    """
+    from scipy.optimize import least_squares  # late: a tenth of a second
+
+    low, high, step = lower / width, upper / width, 1e-5 * np.eye(x.size)
+
+    def scaled(z: Array) -> Array:
+        return np.asarray(residuals(z[None] * width)[0] / scale)
+
+    def jacobian(z: Array) -> Array:
+        ahead, behind = np.minimum(z + step, high), np.maximum(z - step, low)
+        span = np.diagonal(ahead) - np.diagonal(behind)
+        forward, backward = np.split(residuals(np.concatenate([ahead, behind]) * width), 2)
+        slope = (forward - backward) / (scale * span[:, None])
+        # A step beyond where the model has a value says nothing about that direction.
+        return np.asarray(np.nan_to_num(slope, nan=0.0, posinf=0.0, neginf=0.0).T)
+
+    start = np.clip(x / width, low, high)
+    found = least_squares(
+        scaled, start, jac=jacobian, bounds=(low, high), x_scale="jac", ftol=1e-13, xtol=1e-13,
+        gtol=1e-13, max_nfev=400,
+    )  # fmt: skip
+    count = found.nfev + 2 * x.size * (found.njev or 0)
+    cost = 2.0 * float(found.cost) * scale**2
+    return Minimum(found.x * width, count, bool(found.success), cost=cost)
+
+
+def scatter_of(problem: Problem) -> float:
+    """Size of the responses about their mean, by which residuals are of the order of one."""
+    return float(np.linalg.norm(problem.response - problem.response.mean())) or 1.0
+
+
+def descend_from(problem: Problem, t: Array) -> Minimum:
+    """Descend from internal coordinates (d,) within the prior's bounds."""
+    lower, upper = np.array([(p.lower, p.upper) for p in problem.priors.free]).T
+    return descend(
+        lambda t: problem.residuals(problem.theta(t)), t, lower, upper,
+        prior_widths(problem.priors), scatter_of(problem),
+    )  # fmt: skip
 
 
 def search_space(problem: Problem, box: Box | None = None) -> SearchSpace:
@@ -314,7 +349,7 @@ def edge_notes(names: tuple[str, ...], x: Array, lower: Array, upper: Array, wha
 
 
 def fit_identified(
-    problem: Problem, method: str, fit: Callable[[Problem], tuple[Array, Found, str]]
+    problem: Problem, method: str, fit: Callable[[Problem], tuple[Array, Minimum, str]]
 ) -> PointEstimate:
     """Hold what the data do not determine, fit the rest, and complete the estimate.
 
@@ -326,7 +361,7 @@ def fit_identified(
         theta, found, edges = fit(reduced)
     else:
         theta, edges = reduced.of_model(reduced.theta(np.empty((1, 0))))[0], ""
-        found = Found(np.empty(0), 1, True, "every parameter is fixed")
+        found = Minimum(np.empty(0), 1, True, "every parameter is fixed")
     return goodness(
         problem,
         method,
@@ -346,11 +381,11 @@ def fit_identified(
 
 
 def search_in_box(
-    problem: Problem, method: str, box: Box | None, minimise: Callable[[SearchSpace], Found]
+    problem: Problem, method: str, box: Box | None, minimise: Callable[[SearchSpace], Minimum]
 ) -> PointEstimate:
     """Estimate what the data determine by searching the box."""
 
-    def fit(reduced: Problem) -> tuple[Array, Found, str]:
+    def fit(reduced: Problem) -> tuple[Array, Minimum, str]:
         space = search_space(reduced, box)
         found = minimise(space)
         if not np.isfinite(space.cost(found.x[None]))[0]:
@@ -375,7 +410,7 @@ def estimate_differential_evolution(
     """
     from scipy.optimize import differential_evolution  # late: a tenth of a second
 
-    def minimise(space: SearchSpace) -> Found:
+    def minimise(space: SearchSpace) -> Minimum:
         evaluated = 0
 
         def cost(x: Array) -> Array:
@@ -395,6 +430,6 @@ def estimate_differential_evolution(
             rng=rng,
             **settings,
         )
-        return Found(np.asarray(result.x), evaluated, bool(result.success))
+        return Minimum(np.asarray(result.x), evaluated, bool(result.success))
 
     return search_in_box(problem, "differential_evolution", box, minimise)

@@ -30,7 +30,6 @@ import numpy as np
 
 from calib.models.base import Array, Conditions, References
 from calib.models.card import Equation, from_cards
-from calib.models.constants import DENSITIES
 
 PRESSURE, WIDTH = "average_ground_pressure_kpa", "plate_width_mm"
 
@@ -92,7 +91,7 @@ def _ln_density(target: Array, water: Array, A2: Array, A3: Array, A4: Array) ->
     def excess(x: Array, target: Array, water: Array, A2: Array, A3: Array, A4: Array) -> Array:
         return np.asarray(A2 * x - _ln_wet(water * np.exp(-x), A3, A4) - target)
 
-    ends = tuple(np.log(DENSITIES))
+    ends = float(np.log(0.1)), float(np.log(5.0))  # g/cm^3, beyond all soils
     found = find_root(excess, ends, args=(target, water, A2, A3, A4), tolerances={"xatol": 1e-13})
     return np.where(found.success, found.x, np.nan)
 

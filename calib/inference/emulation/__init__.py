@@ -24,13 +24,7 @@ from scipy.special import ndtr
 from calib.batch.environment import one_thread
 from calib.data.files import plain_number
 from calib.data.quantities import QUANTITIES
-from calib.inference.constants import (
-    AMONG_FAILED,
-    EDGE_WORTH,
-    FORESEEN_FROM,
-    NEGLIGIBLE,
-    WORTH,
-)
+from calib.inference.constants import FORESEEN_FROM, NEGLIGIBLE
 from calib.inference.design import (
     across_zero,
     check_moves,
@@ -86,9 +80,9 @@ def emulate(
     state = State(
         problem, keeper, nodes, seed, chosen.runs, across=across, tried=tried, progress=progress
     )
-    own_noise = _first_design(state, chosen)
+    _first_design(state, chosen)
     state.rebuild()
-    return _improved(state, chosen, chosen.runs, own_noise)
+    return _improved(state, chosen, chosen.runs)
 
 
 @one_thread()
@@ -108,10 +102,10 @@ def extend(
     stays so. The emulation's runs are the new ones, `more` at the most.
     """
     state = State.beyond(emulator, problem, keeper, seed, more, progress)
-    return _improved(state, settings or EmulationSettings(), more, 0.0)
+    return _improved(state, settings or EmulationSettings(), more)
 
 
-def _improved(state: State, chosen: EmulationSettings, most: int, own_noise: float) -> Emulation:
+def _improved(state: State, chosen: EmulationSettings, most: int) -> Emulation:
     """Make runs where the posterior needs them, then some to check the emulator on."""
     history: list[tuple[int, float]] = []
     checks = chosen.checks_of(most)
@@ -130,12 +124,12 @@ def _improved(state: State, chosen: EmulationSettings, most: int, own_noise: flo
         if partly and state.emulator.holds(z).any():
             # Where no run was made among those that failed there may seem to be room.
             z = state.sample(len(history) + 2)
-            good &= state.among_failed(z) <= AMONG_FAILED
+            good &= not state.lost(z)
         if good or state.left <= checks:
             break
     if not state.emulator.holds(z).any():
         raise state.without_value("no parameters are left for the data")
-    if partly and state.among_failed(z) > AMONG_FAILED:
+    if partly and state.lost(z):
         raise state.without_value("the posterior lies among runs that failed")
     for name in idle(state, z):
         _log.warning(
@@ -143,7 +137,7 @@ def _improved(state: State, chosen: EmulationSettings, most: int, own_noise: flo
             'hold it with dist = "fixed", or see whether the simulator reads it',
             state.problem.bound.model.name, name,
         )  # fmt: skip
-    return judged(state, z, chosen, measured, own_noise, history)
+    return judged(state, z, chosen, measured, history)
 
 
 def _needed(
@@ -160,11 +154,11 @@ def _needed(
         z = state.sample(len(history) + 1)
         history.append((len(state.runs), state.error(z)))
         room = state.left - checks
-        small = history[-1][1] <= WORTH * chosen.tolerance
+        small = history[-1][1] <= 0.8 * chosen.tolerance
         if state.emulator.support is not None:
             # An edge has to be found as well: the error has to be small twice in a row.
             last = [error for _, error in history[began:]][-2:]
-            small = len(last) > 1 and max(last) <= EDGE_WORTH * chosen.tolerance
+            small = len(last) > 1 and max(last) <= 0.3 * chosen.tolerance
         if room < 1 or (all_ran and small):
             return z
         off = history[-1][1]
@@ -202,8 +196,8 @@ def _nodes(
     return wide, across, tried
 
 
-def _first_design(state: State, chosen: EmulationSettings) -> float:
-    """Spread runs over the prior, some of them twice; return the sd of the simulator's noise."""
+def _first_design(state: State, chosen: EmulationSettings) -> None:
+    """Spread runs over the prior, some of them twice, to see the simulator's noise."""
     d, deterministic = int(state.free.sum()), state.keeper.simulator.deterministic
     before = len(state.runs)
     theta = prior_design(state.problem, chosen.spread(d, deterministic, before), state.seed)
@@ -228,7 +222,7 @@ def _first_design(state: State, chosen: EmulationSettings) -> float:
     count, times = chosen.repeats(deterministic)
     repeats = np.flatnonzero(ok)[: min(count, state.left // times)]
     if not repeats.size:
-        return 0.0
+        return
     again = [state.repeat(theta[repeats], r) for r in range(1, times + 1)]
     apart = state.tamed(np.stack([values[repeats], *again]))
     own = float(np.sqrt(np.nanmean(apart.var(axis=0, ddof=1))))
@@ -237,8 +231,6 @@ def _first_design(state: State, chosen: EmulationSettings) -> float:
         for found in again:
             state.learn(theta[repeats], found)
         state.own_noise = own
-        return own
-    return 0.0
 
 
 def _next(state: State, z: Array, count: int, step: int) -> Array:
@@ -327,7 +319,7 @@ def _compared(state: State, off: Array, rest: Array, variances: Array) -> HeldOu
 
 def judged(
     state: State, z: Array, chosen: EmulationSettings, measured: HeldOut | None,
-    own_noise: float, history: Sequence[tuple[int, float]],
+    history: Sequence[tuple[int, float]],
 ) -> Emulation:  # fmt: skip
     """Put together what became of an emulation, and whether it is good enough."""
     expected, between = state.error(z), _between(state, z)
@@ -336,7 +328,7 @@ def judged(
     off = measured.rmse if measured is not None else expected
     if off > chosen.tolerance:
         more = "give it more runs, or tighter priors"
-        if own_noise and state.keeper.simulator.deterministic:
+        if state.own_noise and state.keeper.simulator.deterministic:
             more = _SCATTERS
         elif state.most:
             more += f" ({foreseen(state, z, chosen, history)})"
@@ -354,8 +346,9 @@ def judged(
             f"{chosen.tolerance:g} are allowed, and rows of the data lie there: give it more nodes"
         )
     return Emulation(
-        state.emulated, state.emulator, tuple(state.runs), measured, expected, between, own_noise,
-        not reasons, tuple(reasons), tuple(history), bool(state.earlier), wider, shifted,
+        state.emulated, state.emulator, tuple(state.runs), measured, expected, between,
+        state.own_noise, not reasons, tuple(reasons), tuple(history), bool(state.earlier), wider,
+        shifted,
     )  # fmt: skip
 
 

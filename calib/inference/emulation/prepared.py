@@ -60,7 +60,7 @@ def emulate_table(
         z = state.sample(step)
     state.rebuild()
     history = [(len(training.theta), state.error(z))]
-    return judged(state, z, settings, left_out(state), 0.0, history)
+    return judged(state, z, settings, left_out(state), history)
 
 
 def read_runs(simulator: Simulator, problem: Problem) -> Training:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from calib.errors import CalibError
-from calib.inference.constants import NEGLIGIBLE, WILD
+from calib.inference.constants import NEGLIGIBLE
 from calib.inference.design import across_zero
 from calib.inference.mode import prior_widths
 from calib.inference.problem import Problem
@@ -299,7 +299,7 @@ class State:
         if not values.size:
             return -np.inf, np.inf
         low, high = float(values.min()), float(values.max())
-        return low - WILD * (high - low), high + WILD * (high - low)
+        return low - 10.0 * (high - low), high + 10.0 * (high - low)
 
     def _near(self) -> tuple[Array, bool]:
         """Return the values of runs near the posterior; of all, and false, while few are there."""
@@ -339,13 +339,13 @@ class State:
         rows = self.problem.response.size
         return float(np.sqrt(self.row_variance(z).mean() / rows)) / self.sigma
 
-    def among_failed(self, z: Array) -> float:
-        """Return the share of draws to which a run that failed is closer than any other."""
+    def lost(self, z: Array) -> bool:
+        """Whether to most draws a run that failed is closer than any other: no value is known."""
         if self.region is None:
-            return 0.0
+            return False
         runs = self.region.coordinates(self.axes.of(self.training.theta))
         nearest = cdist(self.region.coordinates(z), runs).argmin(axis=1)
-        return float((~self.training.ok[nearest]).mean())
+        return bool((~self.training.ok[nearest]).mean() > 0.5)
 
     def row_variance(self, z: Array) -> Array:
         """Sum over the data's rows of the emulator's variance, shape (k,)."""

@@ -29,7 +29,6 @@ from calib.models.base import (
     check_names,
     check_word,
 )
-from calib.models.constants import LISTED_FAILURES
 from calib.models.simulators.runner import CallableRunner, TableRunner
 from calib.models.simulators.simulator import (
     FAILED,
@@ -168,7 +167,7 @@ def slow_simulator(model: str) -> Simulated | None:
 
 @dataclass
 class Tally:
-    """Runs that this process made of a simulator, and those that failed."""
+    """Runs that this process made of a simulator, and the first 200 that failed."""
 
     tried: bool = False
     made: int = 0
@@ -180,7 +179,7 @@ class Tally:
         self.made += 1
         if run.failure is not None:
             self.lost += 1
-            self.failed += [run] * (len(self.failed) < LISTED_FAILURES)
+            self.failed += [run] * (len(self.failed) < 200)
 
 
 @dataclass(frozen=True)

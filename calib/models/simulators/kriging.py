@@ -30,16 +30,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 
 from calib.models.base import Array
-from calib.models.constants import (
-    AT_ONCE,
-    BEYOND_NODES,
-    LENGTHS,
-    NODE_LENGTHS,
-    NUGGETS,
-    NUGGETS_NOISY,
-    NUGGETS_OVER,
-    STEP_INSIDE,
-)
+from calib.models.constants import BEYOND_NODES, NUGGETS_OVER, STEP_INSIDE
 
 
 @dataclass(frozen=True)
@@ -101,7 +92,8 @@ class Kriging:
 
 def chunks(at: Array) -> Iterator[Array]:
     """Return points (k, d) a few at a time, at least once: correlations take memory."""
-    return (at[i : i + AT_ONCE] for i in range(0, max(len(at), 1), AT_ONCE))
+    few = 512
+    return (at[i : i + few] for i in range(0, max(len(at), 1), few))
 
 
 def trend_of(x: Array) -> Array:
@@ -161,11 +153,11 @@ def find_scales(x: Array, y: Array, *, noisy: bool = False, start: Scales | None
     spread = float(np.sqrt(np.square(rest).mean()))
     if spread <= 1e-12 * max(float(np.abs(y).max()), 1e-300):
         return start or Scales(np.full(x.shape[1], 3.0), 1e-6)
-    nuggets = NUGGETS_NOISY if noisy else NUGGETS
+    nuggets = 1e-9, 1.0 if noisy else 1e-3
     lengths = np.full(x.shape[1], 2.0) if start is None else np.clip(start.lengths, 0.3, 60.0)
     nugget = 1e-5 if start is None else start.nugget
     nugget = float(np.clip(nugget, 2.0 * nuggets[0], 0.5 * nuggets[1]))
-    shape = RBF(lengths, LENGTHS) + WhiteKernel(nugget, nuggets)
+    shape = RBF(lengths, (0.2, 100.0)) + WhiteKernel(nugget, nuggets)
     found = fitted_kernel(ConstantKernel(1.0, (1e-2, 1e6)) * shape, x, rest / spread, 1e-10).k2
     return Scales(np.atleast_1d(found.k1.length_scale), float(found.k2.noise_level))
 
@@ -298,6 +290,6 @@ def _lengths(u: Array, curves: Array) -> Array:
 
     spread = curves.std(axis=1, keepdims=True)
     scaled = ((curves - curves.mean(axis=1, keepdims=True)) / np.where(spread > 0, spread, 1.0)).T
-    kernel = ConstantKernel(1.0, (1e-1, 1e5)) * Matern(np.full(u.shape[1], 0.5), NODE_LENGTHS, 2.5)
+    kernel = ConstantKernel(1.0, (1e-1, 1e5)) * Matern(np.full(u.shape[1], 0.5), (0.03, 20.0), 2.5)
     found = fitted_kernel(kernel, u, scaled, NUGGETS_OVER[-1])
     return np.asarray(np.atleast_1d(found.k2.length_scale) * np.ones(u.shape[1]))

@@ -25,14 +25,14 @@ from calib.data.quantities import QUANTITIES, convert, real_array
 from calib.data.table import parse_header
 from calib.errors import CalibError
 from calib.models.base import Array
-from calib.models.constants import FIRST_RUNS, TAIL_CHARACTERS, WORTH_SECONDS
+from calib.models.constants import FIRST_RUNS, TAIL_CHARACTERS
 
 _log = logging.getLogger(__name__)
 
 type Kind = Literal["time", "exit", "nan", "short", "unreadable", "error"]
 type Values = Mapping[str, Array]
 # Raw outputs by the simulator's own names.
-type Found = Mapping[str, Any]
+type RawOutputs = Mapping[str, Any]
 
 # Columns of the list of failed runs, next to their parameters.
 FAILED = ("kind", "reason", "printed")
@@ -52,13 +52,13 @@ class Failure:
 
 
 type Result = Values | Failure
-type Given = Found | Failure
+type Given = RawOutputs | Failure
 
 
 class Printed(dict[str, Any]):
     """Outputs of a run with what it printed, for error messages."""
 
-    def __init__(self, outputs: Found, printed: str) -> None:
+    def __init__(self, outputs: RawOutputs, printed: str) -> None:
         super().__init__(outputs)
         self.printed = printed
 
@@ -189,7 +189,7 @@ class Simulator:
             found[name] = convert(conditions[column], QUANTITIES[column].unit, unit)
         return found
 
-    def converted(self, found: Found, output: str) -> Array:
+    def converted(self, found: RawOutputs, output: str) -> Array:
         """Return an output, by its canonical column, in its canonical unit."""
         own = next(o for o in self.outputs if self.canonical(o.header) == output)
         unit = _parsed(own.header, self.name)[1]
@@ -239,7 +239,7 @@ def no_output(column: str, found: Iterable[str]) -> str:
     return f"there is no output {column!r}; it gave {', '.join(map(str, found)) or 'nothing'}"
 
 
-def checked(found: Found, column: str, n: int, unit: str) -> Array | Failure:
+def checked(found: RawOutputs, column: str, n: int, unit: str) -> Array | Failure:
     """Return one output as n numbers in a unit, or a failure."""
     printed = found.printed if isinstance(found, Printed) else ""
     if column not in found:
@@ -363,7 +363,7 @@ class RunKeeper:
                 run_tasks(_carry_out, {missing[0]: items[missing[0]]}, folder)
                 self.seconds = read_seconds(folder).get(missing[0], 0.0)
                 self.made, self.kept = self.made + 1, self.kept - 1
-        parallel = self.seconds * len(items) > WORTH_SECONDS
+        parallel = self.seconds * len(items) > 8.0  # s, from which starting processes pays off
         outcome = run_tasks(
             _carry_out, items, folder, workers=self.workers if parallel else 1,
             scheduler=self.scheduler, progress=self.progress, give_up=FIRST_RUNS,
