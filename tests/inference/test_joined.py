@@ -60,14 +60,6 @@ def test_volumes_are_the_same(wheel: Problem) -> None:
     assert np.linalg.det(jacobian) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_prior_draws_are_those_by_parameter(wheel: Problem) -> None:
-    cube = np.random.default_rng(4).uniform(size=(20, wheel.n_dim))
-    again = joined(wheel)
-    np.testing.assert_allclose(
-        again.theta(again.priors.ppf(cube)), wheel.theta(wheel.priors.ppf(cube))
-    )
-
-
 def test_a_fixed_or_bounded_parameter_is_sampled_as_it_is(wheel: Problem) -> None:
     assert joined(wheel.with_fixed({"k1": 20.0})).priors.names == wheel.names[1:]
     assert not isinstance(joined(wheel.with_fixed({"k1": 20.0})).priors, SumAndRatio)

@@ -80,7 +80,7 @@ def test_memory_is_bounded() -> None:
     """Some arrays of the cells that are evaluated at once, whatever the rows and vectors."""
     bound, theta, conditions, response = data("magic_formula_pressure", 5, 100_000)
     squares = SumOfSquares.of(bound, conditions, response)
-    many = np.tile(theta, (100, 1))
+    many = np.tile(theta, (10, 1))
     tracemalloc.start()
     squares(many)
     peak = tracemalloc.get_traced_memory()[1]

@@ -18,7 +18,7 @@ from calib.inference.prior_files import (
     read_priors,
     relative_columns,
 )
-from calib.inference.priors import Prior, Priors, prior_references
+from calib.inference.priors import Priors, prior_references
 from calib.models import MODELS
 
 ENTRY = '[parameters.{name}]\nunit = "1"\nreason = "a test"\nsource = "nobody"\n'
@@ -337,13 +337,6 @@ def test_there_are_priors_for_every_model_and_they_give_its_parameters() -> None
         priors = read_priors(default_priors(name), name, (*model.parameters, "sigma"), {})
         assert tuple(p.name for p in priors.entries) == (*model.parameters, "sigma")
         assert priors.entries[-1].lower >= 0.0 or priors.entries[-1].log
-
-
-def test_a_prior_says_what_it_is() -> None:
-    (prior,) = one('dist = "normal"\nmean = 1\nsd = 2\nlower = 0').entries
-    assert prior.text == "normal(1, 2) on [0, inf]"
-    assert isinstance(prior, Prior)
-    assert not prior.fixed
 
 
 def test_a_prior_may_be_relative_to_any_column() -> None:

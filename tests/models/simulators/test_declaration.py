@@ -108,14 +108,6 @@ def test_what_no_command_and_no_path_can_be(tmp_path: Path, key: str, text: str)
         read_simulator(file)
 
 
-@pytest.mark.parametrize("key", ["run", "python"])
-def test_a_link_to_itself_is_no_program(tmp_path: Path, key: str) -> None:
-    (tmp_path / "loop.py").symlink_to("loop.py")
-    given = {"run": '"./loop.py {input}"'} if key == "run" else {"run": '""', key: '"loop.py:f"'}
-    with pytest.raises(CalibError, match=r"loop\.py"):
-        read_simulator(write_program(tmp_path, **given))
-
-
 def test_a_python_function_in_a_file(tmp_path: Path) -> None:
     (tmp_path / "own_wheel.py").write_text("def f(theta, x):\n    return theta[:, :1] * x['s']\n")
     file = write_program(tmp_path, run="", python='"own_wheel.py:f"', emulate="false")

@@ -24,11 +24,11 @@ from calib.models.simulators.files import read_simulator
 from calib.models.simulators.process import run_program
 from calib.models.simulators.runner import (
     CallableRunner,
-    CommandRunner,
     UmbridgeRunner,
     check_template,
+    output_of_text,
 )
-from calib.models.simulators.simulator import Failure
+from calib.models.simulators.simulator import Failure, checked
 from tests.models.simulators.examples import (
     EXACT,
     PRIORS,
@@ -128,17 +128,6 @@ def _ends(pid: int) -> bool:
             return True
         time.sleep(0.05)
     return False
-
-
-def test_what_the_kernel_cannot_end_is_not_waited_for_for_ever(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked = []
-    stuck = SimpleNamespace(kill=lambda: asked.append(1))
-    monkeypatch.setattr("calib.models.simulators.process._marked", lambda mark: [stuck])
-    monkeypatch.setattr("calib.models.simulators.process.KILL_SECONDS", 0.2)
-    assert run_program(python("print('done')"), tmp_path, 20.0) == "done\n"
-    assert len(asked) > 1
 
 
 def hangs(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
@@ -253,20 +242,6 @@ def test_what_cannot_be_handed_over_is_told() -> None:
         simulator(CallableRunner(locked, ("pull",), limit=60.0)).run(THETA, X)
 
 
-def test_a_function_of_a_file_has_the_limit_that_the_file_gives(tmp_path: Path) -> None:
-    """The module of the file has no name that another process could import."""
-    (tmp_path / "own.py").write_text(
-        "import numpy as np\nSCALE = 1000.0\ndef pull(theta, x):\n"
-        "    return SCALE * x['w'] * theta[:, :1] * (1 - np.exp(-x['s'] / 100 / theta[:, 1:2]))\n"
-    )
-    for given, limit in (("60", 60.0), ("", None)):
-        file = write_program(tmp_path, run="", python='"own.py:pull"', limit=given)
-        runner = read_simulator(file).simulator.runner
-        assert isinstance(runner, CallableRunner)
-        assert runner.limit == limit
-        is_exact(simulator(runner).run(THETA, X))
-
-
 # As many parameter vectors as rows: what is transposed has the right shape.
 SOME = np.array([[0.6, 0.08], [0.5, 0.1], [0.7, 0.2]])
 
@@ -315,20 +290,6 @@ def selfish(t: np.ndarray, x: dict) -> object:
     del x["s"]
     CALLS.append(1)
     return exact if len(CALLS) % 2 == 0 else {"pull": np.full(exact["pull"].shape, np.nan)}
-
-
-@pytest.mark.parametrize("batched", [True, False])
-def test_a_retry_sees_the_conditions_of_the_run(batched: bool) -> None:
-    CALLS.clear()
-
-    def f(t: np.ndarray, x: dict) -> object:
-        return selfish(t if batched else t[None], x)
-
-    runner = CallableRunner(f, ("pull",), batched)
-    assert isinstance(simulator(runner).run(THETA, X), Failure)
-    CALLS.clear()
-    is_exact(simulator(runner, retries=1).run(THETA, X))
-    assert len(CALLS) == 2
 
 
 @pytest.mark.parametrize("of", [quick, plain])
@@ -399,39 +360,27 @@ def test_a_program_that_fails(tmp_path: Path, extra: str, kind: str, word: str) 
 @pytest.mark.parametrize(
     ("printed", "gives", "word"),
     [
-        ("step,pull\\n0,1500\\n1,-2.5", "csv", None),
-        ("step 1\\nF=1500 N\\nstep 2\\nF=-2.5 N", "pattern", None),
+        ("step,pull\n0,1500\n1,-2.5", "csv", None),
+        ("step 1\nF=1500 N\nstep 2\nF=-2.5 N", "pattern", None),
         # A list without spaces is read number by number.
         ("F=1.5D3,F=-25e-1", "pattern", None),
         ("", "csv", "it is empty"),
         ('{"pull": [1, 2], "pull": [3, 4]}', "json", "'pull' is there twice"),
-        ("pull,pull\\n1,3\\n2,4", "csv", "'pull' is there twice"),
-        ("step,pull\\n1,1,5\\n2,2,5", "csv", "different numbers of cells"),
-        ("pull\\n1_5\\n2.0", "csv", "'1_5' is no number"),
+        ("pull,pull\n1,3\n2,4", "csv", "'pull' is there twice"),
+        ("step,pull\n1,1,5\n2,2,5", "csv", "different numbers of cells"),
+        ("pull\n1_5\n2.0", "csv", "'1_5' is no number"),
         ("F=1.5e+03 F=2.5e+03 ", "pattern", "the beginning of '1.5e+03'"),
         ("F=1,5 F=2,5 ", "pattern", "the beginning of '1,5'"),
     ],
 )
-def test_text_is_read_whole_or_refused(
-    tmp_path: Path, printed: str, gives: str, word: str | None
-) -> None:
-    extra = f"print('{printed}'); sys.exit()"
-    file = write_program(
-        tmp_path, extra=extra, retries="0", output=f'"{gives}"',
-        run=f'"{sys.executable} wheel.py {{input}}"',
-    )  # fmt: skip
-    if gives == "pattern":
-        pattern = "[-0-9.]+" if word else "[-0-9.De]+"
-        text = file.read_text()
-        file.write_text(
-            text.replace("[conditions]", f"[patterns]\npull = 'F=({pattern})'\n[conditions]")
-        )
-    found = read_simulator(file).simulator.run(THETA, X)
+def test_text_is_read_whole_or_refused(printed: str, gives: str, word: str | None) -> None:
+    pattern = "F=([-0-9.]+)" if word else "F=([-0-9.De]+)"
+    found = output_of_text(printed, gives, {"pull": pattern})
+    values = found if isinstance(found, Failure) else checked(found, "pull", 2, "N")
     if word is not None:
-        assert word in failure(found).reason
+        assert word in failure(values).reason
         return
-    assert not isinstance(found, Failure), found
-    np.testing.assert_allclose(found["drawbar_pull_kn"], [1.5, -0.0025])
+    np.testing.assert_allclose(values, [1500.0, -2.5])
 
 
 def test_a_row_that_gives_two_numbers_takes_no_others_place(tmp_path: Path) -> None:
@@ -483,12 +432,6 @@ def test_a_program_may_read_and_write_csv(tmp_path: Path) -> None:
 def test_a_template_must_have_a_place_for_each(template: str, word: str) -> None:
     with pytest.raises(CalibError, match=rf"wheel.inp: .*{word}"):
         check_template(template, ("mu", "n", "s", "w"), "wheel.inp")
-
-
-def test_a_program_beside_the_file_is_found(tmp_path: Path) -> None:
-    (tmp_path / "wheel").write_text("#!/bin/sh\n")
-    assert CommandRunner(("./wheel",), tmp_path).program == str((tmp_path / "wheel").resolve())
-    assert CommandRunner(("./no-wheel",), tmp_path).program is None
 
 
 @pytest.fixture(scope="module")
