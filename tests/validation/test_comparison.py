@@ -54,7 +54,7 @@ def plates(seed: int, friction: float) -> calib.Table:
 @pytest.fixture(scope="module")
 def frictional() -> Comparison:
     fitted, held = hold_out(plates(1, 1.0), "plate_width_mm", 100.0)
-    return compare(fitted, ["bekker", "reece", "bekker_plate"], 3, held_out=held)
+    return compare(fitted, ["bekker", "reece", "bekker_plate"], 3, held_out=held, settings=FEW)
 
 
 def test_weights_are_those_of_an_optimiser() -> None:
