@@ -326,12 +326,10 @@ def test_errors_before_and_after_are_drawn_with_units_and_a_key(found_gaps, name
         assert drawn.size == errors.size + kept_out
     rms = float(np.sqrt(np.mean((own.measured - own.before) ** 2)))
     assert f"{short(rms)} {own.axis.unit} rms" in plate.caption
-    assert before.get_ylim() == after.get_ylim()
     labels = [before.get_ylabel(), *(ax.get_xlabel() for ax in plate.figure.axes)]
     assert all(re.search(r"\(.+\)$", label) for label in labels)
-    words = [text.get_text() for text in plate.figure.legends[0].get_texts()]
-    assert {"90 % of the noise", "90 % of what the calibration left open"} < set(words)
-    assert any("psi" in word for word in words)
+    words = {text.get_text() for text in plate.figure.legends[0].get_texts()}
+    assert {"90 % of the noise", "90 % of what the calibration left open"} < words
     widths, p = [bar.get_width() for bar in which.patches], result.found.ranking.probability
     assert widths == pytest.approx([p[n] for n in result.found.ranking.order[: len(widths)]])
     # What is written beside the longest bar stays on the figure.
