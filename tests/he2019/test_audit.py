@@ -144,8 +144,7 @@ def written(audit, tmp_path_factory):
 
 
 def test_every_finding_is_shown_the_gravest_first(audit, section):
-    reader = Reader()
-    reader.feed(section)
+    reader = Reader(section)
     text = reader.text
     assert reader.open == []
     assert {f"audit-{f.key}" for f in audit.findings} <= set(reader.ids)
@@ -171,8 +170,7 @@ def test_it_holds_in_a_browser(written, browser):
 
 def test_the_page_stands_alone(written):
     html = (written / "index.html").read_text(encoding="utf-8")
-    reader = Reader()
-    reader.feed(html)
+    reader = Reader(html)
     assert reader.open == []
     assert not re.search(r"https?://|@import|url\(", html)
     assert len(reader.ids) == len(set(reader.ids))

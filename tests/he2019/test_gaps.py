@@ -238,8 +238,7 @@ def flat(text: str) -> str:
 
 
 def read(page: Path) -> Reader:
-    reader = Reader()
-    reader.feed(page.read_text(encoding="utf-8"))
+    reader = Reader(page.read_text(encoding="utf-8"))
     assert not reader.open
     return reader
 
