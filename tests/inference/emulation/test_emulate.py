@@ -165,7 +165,7 @@ def test_first_runs_that_fail_in_several_ways_are_no_reason_to_stop() -> None:
             raise RuntimeError("no licence")
         return np.nan * pull(theta, x) if count < 7 else pull(theta, x)
 
-    declared(fickle, "fickle", emulate=True, runs=12, checks=0)
+    declared(fickle, "fickle", emulate=True, runs=16)
     emulation = calib.emulated(calib.build_problem("fickle", table()), seed=1)
     assert len(emulation.failed) == 6
 
