@@ -71,8 +71,7 @@ class Status(StrEnum):
 class Item:
     """One thing that was compared: a file, the path of a number in it, or a claim.
 
-    It belongs to a group, such as ``"rut_depth: posterior"``. None stands for the recorded number,
-    for the one found again, and for the largest difference allowed, where there is none to show.
+    `allowed` is the largest difference allowed. None stands where there is no number to show.
     """
 
     group: str
@@ -163,14 +162,12 @@ def _group_of(place: Place) -> str:
         owner, keys = f"{keys[1]}: ", keys[2:]
     elif file != RUN:
         return file if file in (MANIFEST, SUMMARY) else file.partition(".")[0]
-    match keys[:1]:
-        case ["estimates" | "fit" | "by_pressure"]:
-            return f"{owner}estimates"
-        case [
-            "posterior" | "prior_sensitivity" | "validation" | "sampling" | "gate" | "mode"
-            | "log_evidence" | "efficiency" | "acceptance" | "evaluations"
-        ]:  # fmt: skip
-            return f"{owner}posterior"
+    drawn = ("posterior", "prior_sensitivity", "validation", "sampling", "gate", "mode")
+    drawn += ("log_evidence", "efficiency", "acceptance", "evaluations")
+    if keys and keys[0] in ("estimates", "fit", "by_pressure"):
+        return f"{owner}estimates"
+    if keys and keys[0] in drawn:
+        return f"{owner}posterior"
     return f"{owner}what was computed"
 
 
@@ -329,15 +326,10 @@ def without_numbers(text: str) -> str:
     return _NUMBER.sub("#", text)
 
 
-def read_text(path: Path) -> str:
-    """Return a text, whatever somebody made of it."""
-    return decoded(path.read_bytes(), "replace")
-
-
-def differing_lines(old: Sequence[str], new: Sequence[str]) -> str:
+def differing_lines(old: str, new: str) -> str:
     """Return how many lines two texts do not share, and the first of them."""
-    diff = list(difflib.unified_diff(old, new, n=0, lineterm=""))[2:]  # below the two names
-    changed = [line for line in diff if not line.startswith("@@")]
+    diff = difflib.unified_diff(old.splitlines(), new.splitlines(), n=0, lineterm="")
+    changed = [line for line in list(diff)[2:] if not line.startswith("@@")]  # below the two names
     shown = "; ".join(f"{line[0]} {line[1:].strip()[:400]}" for line in changed[:4])
     return f"{len(changed)} lines differ: {shown}"
 
@@ -358,7 +350,8 @@ def named_pictures(folder: Path, name: str) -> str:
             content = b""
         return f"[picture {figures.get(sha256(content), 'of its own')}]"
 
-    return re.sub(r"data:image/png;base64,([A-Za-z0-9+/=]*)", named, read_text(folder / name))
+    text = decoded((folder / name).read_bytes(), "replace")
+    return re.sub(r"data:image/png;base64,([A-Za-z0-9+/=]*)", named, text)
 
 
 def view(
@@ -382,15 +375,16 @@ def view(
     if of_figure:
         wrong = "it is not, byte for byte, the one drawn again"
         return claim(FIGURES, name, wrong, sure=sure and exact)
-    words = [named_pictures(folder, name).splitlines() for folder in (job.folder, job.made)]
-    if words[0] == words[1]:
+    words = [named_pictures(folder, name) for folder in (job.folder, job.made)]
+    if words[0].splitlines() == words[1].splitlines():
         if sure and exact:
             return claim(FIGURES, name, "its pictures are not, byte for byte, those drawn again")
         return Item(TEXT, name, Status.WITHIN, note="the same but for its pictures")
-    pictures = [re.findall(r"\[picture [^\]]*\]", "\n".join(lines)) for lines in words]
+    pictures = [re.findall(r"\[picture [^\]]*\]", text) for text in words]
     if pictures[0] != pictures[1]:
         return claim(TEXT, name, "it shows other pictures, or in another order", sure=sure)
-    if not exact and without_numbers("\n".join(words[0])) == without_numbers("\n".join(words[1])):
+    plain = [without_numbers("\n".join(text.splitlines())) for text in words]
+    if not exact and plain[0] == plain[1]:
         return Item(TEXT, name, Status.WITHIN, note="the same words")
     excuse = "" if same_draws else "its numbers moved within their tolerance: "
     excuse = excuse if sure else "another version wrote it: "
@@ -420,12 +414,8 @@ def verify_draws(
     except CalibError as error:
         items.append(claim(POSTERIORS, path.name, error.message))
     except FAULTS as error:
-        items.append(_unread(path.name, error))
+        items.append(claim(POSTERIORS, path.name, f"the file cannot be read ({error!r})"))
     return items
-
-
-def _unread(name: str, error: Exception) -> Item:
-    return claim(POSTERIORS, name, f"the file cannot be read ({type(error).__name__}: {error})")
 
 
 def _verify_summary(name: str, file: DrawsFile, stated: Mapping[str, Any]) -> Item:
@@ -477,7 +467,7 @@ def draws(name: str, job: Job) -> Item:
     try:
         old, new = map(_variables, paths)
     except FAULTS as error:
-        return _unread(name, error)
+        return claim(POSTERIORS, name, f"the file cannot be read ({error!r})")
     apart = [key for key in {**old, **new} if not _alike(old.get(key), new.get(key))]
     if apart:
         wrong = f"{', '.join(sorted(apart)[:3])} in it: not what is written again"

@@ -19,7 +19,7 @@ from calib.check.compare import FIGURES, INPUTS, LINE_ENDS, PAGE, TEXT, Item, Jo
 from calib.check.tolerances import drawn_in_comparison, drawn_in_run
 from calib.data import Table
 from calib.data import files as data_files
-from calib.data.files import inside
+from calib.data.files import decoded, inside
 from calib.data.reader import KNOWN_DATA, label_of
 from calib.errors import FAULTS, CalibError
 from calib.gap.batch import INPUTS as DIAGNOSIS_INPUTS
@@ -125,7 +125,7 @@ def verify_texts(
         if not path.is_file():
             wrong = f"missing, though {source} gives it"
         elif unix_lines(path.read_bytes()) != text.encode():
-            lines = compare.differing_lines(compare.read_text(path).splitlines(), text.splitlines())
+            lines = compare.differing_lines(decoded(path.read_bytes(), "replace"), text)
             wrong = f"it does not follow from {source}: {lines}"
         items.append(claim(TEXT, name, wrong, f"it follows from {source}", sure=sure))
     return items

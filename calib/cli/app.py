@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
 
 from calib.cli import (
     INTERRUPTED,
@@ -18,14 +17,14 @@ from calib.cli import (
     campaign,
     check,
     declared,
-    gap,
     interrupted,
     options,
+    prediction,
 )
 from calib.errors import CalibError
 
 
-class _Commands(TyperGroup):
+class _Commands(options.Group):
     """All commands: what the user can put right, or stops, ends with a line and no traceback."""
 
     def invoke(self, ctx: Any) -> Any:
@@ -81,7 +80,7 @@ app = typer.Typer(
 _COMMANDS: Mapping[Callable[..., None], str] = {
     calibration.report: "report my.csv --hold-out inflation_pressure_psi=30 --out report",
     calibration.fit: "fit my.csv --model magic_formula_pressure --out run",
-    calibration.predict: "predict run --at conditions.csv --out predicted.csv",
+    prediction.predict: "predict run --at conditions.csv --out predicted.csv",
     declared.data: "data he2019-gaps --out cases",
     declared.template: "template magic_formula_pressure --out my.csv",
     declared.priors: "priors magic_formula_pressure --out my.toml",
@@ -90,7 +89,7 @@ _COMMANDS: Mapping[Callable[..., None], str] = {
     declared.quantities: "quantities rut_depth --json",
     calibration.compare: "compare bekker reece plates.csv --hold-out plate_width_mm=80 "
     "--out compared",
-    gap.diagnose: "diagnose --run run --field field.csv --out diagnosis",
+    prediction.diagnose: "diagnose --run run --field field.csv --out diagnosis",
     check.check: "check run --json > check.json",
     check.audit: "audit --out audit",
     campaign.campaign: "campaign plan.toml --out results --workers 2",
@@ -98,7 +97,7 @@ _COMMANDS: Mapping[Callable[..., None], str] = {
     check.doctor: "doctor --quick",
 }
 for command, example in _COMMANDS.items():
-    app.command(epilog=f"Example: calib {example}")(command)
+    app.command(cls=options.Command, epilog=f"Example: calib {example}")(command)
 app.add_typer(campaign.challenge, name="challenge")
 
 

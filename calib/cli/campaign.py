@@ -110,11 +110,14 @@ def sbc(
 _Cases = Annotated[Path, typer.Argument(help="Folder with cases.")]
 _Key = Annotated[Path, typer.Option(help="Their sealed answers.")]
 
-challenge = typer.Typer(no_args_is_help=True, help="The blind test of the diagnosis.")
+challenge = typer.Typer(
+    cls=opt.Group, no_args_is_help=True, help="The blind test of the diagnosis."
+)
 
 
 @challenge.command(
-    epilog="Example: calib challenge make --out cases --key key.json --seed 1 --cases 20"
+    cls=opt.Command,
+    epilog="Example: calib challenge make --out cases --key key.json --seed 1 --cases 20",
 )
 def make(
     out: Annotated[Path, typer.Option(help="Folder for the cases.")],
@@ -142,7 +145,7 @@ def make(
     finish(0, {"folder": str(out), "cases": cases, "key_sha256": digest})
 
 
-@challenge.command(epilog="Example: calib challenge run cases --out diagnoses")
+@challenge.command(cls=opt.Command, epilog="Example: calib challenge run cases --out diagnoses")
 def run(
     folder: _Cases,
     out: Annotated[Path, typer.Option(help="Folder for the diagnoses; resumed if it is there.")],
@@ -168,6 +171,7 @@ def run(
 
 @challenge.command(
     "well-specified",
+    cls=opt.Command,
     epilog="Example: calib challenge well-specified cases --key key.json --out plain --out-key "
     "plain.json",
 )
@@ -200,7 +204,10 @@ def well_specified(
     finish(0, {"folder": str(out), "without": without})
 
 
-@challenge.command(epilog="Example: calib challenge score cases --results diagnoses --key key.json")
+@challenge.command(
+    cls=opt.Command,
+    epilog="Example: calib challenge score cases --results diagnoses --key key.json",
+)
 def score(
     ctx: typer.Context,
     folder: _Cases,

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TextIO
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
 from calib.report.numbers import finite
 
@@ -37,6 +38,27 @@ EffectsFile = Annotated[
     Path | None,
     typer.Option("--effects", help="Python file with effects of your own, for this alone."),
 ]
+
+
+class _PlainFlags:
+    """Help without the word bool beside each flag."""
+
+    def get_params(self, ctx: Any) -> Any:
+        params = super().get_params(ctx)  # type: ignore[misc]
+        for param in params:
+            if getattr(param, "is_flag", False):
+                param.metavar = ""
+        return params
+
+
+class Command(_PlainFlags, TyperCommand):
+    """A command of the program."""
+
+
+class Group(_PlainFlags, TyperGroup):
+    """Commands of the program."""
+
+
 CORES = min(2, os.cpu_count() or 1)  # more than two processes bring little
 Workers = Annotated[int, typer.Option(help="Processes on this machine.", min=1, max=1024)]
 Scheduler = Annotated[

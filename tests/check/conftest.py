@@ -1,7 +1,6 @@
-"""A small report, a whole one, a run and a comparison, and copies of them to tamper with.
+"""A small report, a whole one and a run, and copies of them to tamper with.
 
-They are made in processes that round as another processor would; what is tampered with is to be
-found there as here. ``CALIB_MADE_UNDER`` names another setting (`kernels.Setting`).
+``CALIB_MADE_UNDER`` names the setting of another processor (`kernels.Setting`) that makes them.
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ import os
 import shutil
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -27,10 +27,12 @@ from calib.gap.diagnose import diagnose
 from calib.he2019 import sections
 from calib.he2019.audit import run_audit
 from calib.inference.io import recompute_run
+from calib.report.comparison import HELD_OUT, recompute_comparison
+from calib.report.page.diagnosis import render_diagnosis
 from calib.report.publish import publication
 from calib.report.writer import file_hashes
 from calib.validation.validate import posterior_errors
-from tests.check.kernels import ALL, FEW
+from tests.check.kernels import ALL
 
 from . import made
 
@@ -38,47 +40,34 @@ type Change = Callable[[Path], object]
 
 
 @pytest.fixture(scope="package")
-def originals(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of all of them (`made.KINDS`); importing takes as long as making one."""
-    named, out = os.environ.get("CALIB_MADE_UNDER"), tmp_path_factory.mktemp("original")
-    settings = [s for s in ALL if str(s) == named] if named else FEW[:1]
-    if settings:
-        return made.elsewhere(out, settings[0], *made.KINDS)
-    for kind, make in made.KINDS.items():
-        make(out / kind)
-    return out
+def original(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """Make each kind of folder once, as ``CALIB_MADE_UNDER`` says where it is set."""
+    out = tmp_path_factory.mktemp("original")
+    named = [s for s in ALL if str(s) == os.environ.get("CALIB_MADE_UNDER")]
+
+    @cache
+    def folder(kind: str, elsewhere: bool) -> Path:
+        if elsewhere:
+            return made.elsewhere(out, named[0], kind) / kind
+        with patch("calib.report.figures.collect.plates", made.two_plates):
+            return made.KINDS[kind](out / f"{kind}_here")
+
+    return lambda kind, here=False: folder(kind, bool(named) and not here)
 
 
-@pytest.fixture(scope="package")
-def original_here(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The report as this processor makes it."""
-    return made.report(tmp_path_factory.mktemp("original") / "here")
-
-
-@pytest.fixture(scope="package")
-def compared_original_here(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return made.comparison(tmp_path_factory.mktemp("original") / "compared_here")
-
-
-@pytest.fixture(scope="package")
-def whole_original_here(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return made.whole(tmp_path_factory.mktemp("original") / "whole_here")
-
-
-def _copy_of(fixture: str, kind: str = "") -> Any:
+def _copy_of(kind: str, *, here: bool = False) -> Any:
     @pytest.fixture
-    def copy(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-        original = request.getfixturevalue(fixture) / kind
-        return Path(shutil.copytree(original, tmp_path / (kind or fixture)))
+    def copy(original: Callable[..., Path], tmp_path: Path) -> Path:
+        return Path(shutil.copytree(original(kind, here), tmp_path / kind))
 
     return copy
 
 
-report, report_here = _copy_of("originals", "report"), _copy_of("original_here")
+# Figures are judged where numbers are the same to the last bit: on this processor.
+report, report_here = _copy_of("report"), _copy_of("report", here=True)
 # With one of the source's gaps, the audit and figures for print.
-whole, whole_here = _copy_of("originals", "whole"), _copy_of("whole_original_here")
-run = _copy_of("originals", "run")
-compared, compared_here = _copy_of("originals", "comparison"), _copy_of("compared_original_here")
+whole, whole_here = _copy_of("whole"), _copy_of("whole", here=True)
+run = _copy_of("run")
 
 
 @pytest.fixture(autouse=True)
@@ -122,7 +111,7 @@ def computed_once(_made, audited_once, monkeypatch: pytest.MonkeyPatch) -> None:
     def made_once(key: Any, out: Path, make: Callable[[Path], Any]) -> Any:
         kept = folder / sha256(repr(key).encode())
         result = once(key, lambda: make(kept))
-        shutil.copytree(kept, out)
+        shutil.copytree(kept, out, dirs_exist_ok=True)
         return result
 
     def report_again(manifest, tasks, out, progress, pool):
@@ -147,6 +136,17 @@ def computed_once(_made, audited_once, monkeypatch: pytest.MonkeyPatch) -> None:
         key = "diagnosis", seed, *(t[c].tobytes() for t in tables for c in t.columns)
         return once(key, lambda: diagnose(case, seed, **more))
 
+    def compared_again(record, problems, folder, out, progress, workers):
+        tables = [p.table[c].tobytes() for p in problems.values() for c in p.table]
+        tables.append((folder / HELD_OUT).read_bytes())
+        key = "comparison", record.seed, record.settings, *problems, *tables
+
+        def make(kept: Path) -> Any:
+            kept.mkdir()
+            return recompute_comparison(record, problems, folder, kept, progress, workers)
+
+        return made_once(key, out, make)
+
     def reading_once(read: Callable[[Path], Any]) -> Callable[[Path], Any]:
         def read_once(path: Path) -> Any:
             return once((read, sha256(path.read_bytes())), lambda: read(path))
@@ -161,7 +161,13 @@ def computed_once(_made, audited_once, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tolerances, "posterior_errors", errors_once)
     monkeypatch.setattr(check_module, "recompute_report", report_again)
     monkeypatch.setattr(folders, "recompute_run", run_again)
+
+    def rendered_once(document):
+        return once(("page", document.json()), lambda: render_diagnosis(document))
+
+    monkeypatch.setattr(folders, "recompute_comparison", compared_again)
     monkeypatch.setattr(folders, "diagnose", diagnosed_once)
+    monkeypatch.setattr(folders, "render_diagnosis", rendered_once)
     for name in ("_variables", "read_draws"):
         monkeypatch.setattr(compare, name, reading_once(getattr(compare, name)))
 

@@ -1,6 +1,4 @@
-"""A small report, a whole one, a run and a comparison, made as another processor would.
-
-In a process of its own.
+"""A small report, a whole one, a run and a comparison; the first three as another processor would.
 
 As a program: python -m tests.check.made FOLDER KIND ...; each gets its name in the folder.
 """
@@ -9,6 +7,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -55,6 +54,7 @@ def rut_tasks() -> list[Task]:
     return [task for task in he2019_tasks() if task.output == "rut_depth"]
 
 
+@cache
 def rut_study(seed: int = 2019) -> Report:
     return work_out(rut_tasks(), seed, settings=SETTINGS)
 
@@ -93,11 +93,6 @@ def comparison(out: Path, seed: int = 2019) -> Path:
     """Two models of plates as `calib compare` compares them, one width held out."""
     path = out.with_suffix(".csv")
     path.write_text(example_csv("reece"))
-    return compared(path, out, seed)
-
-
-def compared(path: Path, out: Path, seed: int = 2019) -> Path:
-    """A comparison on the rows of a file."""
     fitted, held = hold_out(read_table(path), "plate_width_mm", 80.0)
     found = compare(fitted, ["bekker_plate", "bekker"], seed, held_out=held, settings=SETTINGS)
     out.mkdir()
@@ -111,7 +106,7 @@ def fitted_run(problem: Problem, seed: int) -> Calibration:
     return calibrate(problem, seed, estimates=(point,), settings=SETTINGS)
 
 
-KINDS = {"report": report, "whole": whole, "run": run, "comparison": comparison}
+KINDS = {"report": report, "whole": whole, "run": run}
 
 
 def elsewhere(folder: Path, setting: Setting, *kinds: str) -> Path:

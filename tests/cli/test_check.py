@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from importlib.metadata import version
 from pathlib import Path
 
@@ -17,25 +16,6 @@ from calib.errors import CalibError
 from calib.he2019 import embedded
 from calib.models import MODELS
 from tests.commands import Calib
-
-
-@pytest.fixture(scope="module")
-def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where the run is kept, once it is made."""
-    return tmp_path_factory.mktemp("kept") / "run"
-
-
-@pytest.fixture
-def run(calib: Calib, kept: Path) -> Path:
-    """A run folder, in the current folder."""
-    embedded.write(Path("data"))
-    if not kept.exists():
-        made = calib(
-            "fit", "data/rut_depth.csv", "--model", "bekker", "--out", kept,
-            "--hold-out", "inflation_pressure_psi=30", "--seed", 4,
-        )  # fmt: skip
-        assert made.code == 0, made.err
-    return Path(shutil.copytree(kept, "run"))
 
 
 def test_the_verdict_is_first_and_machines_read_a_document(calib: Calib, run: Path) -> None:
@@ -75,6 +55,7 @@ def test_what_differs_is_listed_and_ends_with_1(calib: Calib, run: Path) -> None
 
 
 def test_what_cannot_be_checked_ends_with_2(calib: Calib, run: Path) -> None:
+    Path("data").mkdir()
     for folder in ("absent", "data"):
         refused = calib("check", folder, "--json")
         assert refused.code == 2

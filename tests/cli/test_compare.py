@@ -11,13 +11,12 @@ import pytest
 from calib.batch.folders import check_folder
 from calib.models import example_csv
 from calib.report.comparison import table
-from calib.report.figures.collect import plates
 from tests.browser import Browser, faults
 from tests.commands import Calib
 from tests.inference.emulation.test_emulate import as_before as as_before
 from tests.models.simulators.examples import lab, write_program
 
-FEW = ["--max-steps", 800, "--workers", 1]
+FEW = ["--max-steps", 200, "--workers", 1]
 
 
 def test_models_are_compared_and_the_stack_predicts(calib: Calib) -> None:
@@ -43,8 +42,8 @@ def test_models_are_compared_and_the_stack_predicts(calib: Calib) -> None:
     assert "run `calib compare` again" in broken.err
 
 
-def test_a_report_has_it_as_a_section(calib: Calib, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("calib.report.figures.collect.plates", lambda *args: plates(*args)[:1])
+@pytest.mark.usefixtures("_one_figure")
+def test_a_report_has_it_as_a_section(calib: Calib) -> None:
     rows = [line.rpartition(",") for line in example_csv("reece").split()[1:]]
     lines = ["average_ground_pressure_kpa,plate_width_mm,Sinkage [inch]"]
     lines += [f"{conditions},{float(depth) / 25.4!r}" for conditions, _, depth in rows]

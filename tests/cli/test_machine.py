@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shlex
-import shutil
 import subprocess
 import sys
 from importlib.metadata import version
@@ -19,22 +18,7 @@ from calib.cli.app import app
 from calib.models import example_csv
 from tests.commands import Calib
 
-FEW = ("--max-steps", 800)
-
-
-@pytest.fixture(scope="module")
-def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where the run is kept, once it is made."""
-    return tmp_path_factory.mktemp("kept") / "run"
-
-
-@pytest.fixture
-def run(calib: Calib, kept: Path) -> Path:
-    if not kept.exists():
-        Path("my.csv").write_text(example_csv("modified_bekker"))
-        made = calib("fit", "my.csv", "--model", "modified_bekker", "--out", kept, *FEW)
-        assert made.code in (0, 3), made.err
-    return Path(shutil.copytree(kept, "run"))
+FEW = ("--max-steps", 200)
 
 
 def test_a_fit_prints_its_run_and_what_was_held_out(calib: Calib) -> None:
@@ -110,6 +94,13 @@ def test_every_help_has_an_example_that_is_understood(verb: str) -> None:
     assert typed.startswith(f"calib {verb} ")
     with command.make_context(verb, typed.removeprefix(f"calib {verb} ").split()):
         pass
+
+
+def test_no_help_shows_the_type_of_a_flag(calib: Calib) -> None:
+    for words in ((), ("report",), ("challenge",), ("challenge", "well-specified")):
+        told = calib(*words, "--help").out
+        assert "--help" in told
+        assert "bool" not in told.lower()
 
 
 def test_the_version(calib: Calib) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from calib.batch.environment import sha256
-from calib.cli.gap import diagnose as cli_diagnose
+from calib.cli.prediction import diagnose as cli_diagnose
 from calib.gap.diagnose import diagnose
 from tests.commands import Calib, assert_refused, contents
 from tests.gap_files import SOFT_PATCH
@@ -128,11 +128,9 @@ def test_what_is_to_be_diagnosed_has_to_be_clear(calib: Calib) -> None:
     assert not Path("found").exists()
 
 
-def test_effects_are_of_a_diagnosis_alone(calib: Calib) -> None:
-    assert calib("template", "bekker", "--out", "ruts.csv").code == 0
-    assert calib("fit", "ruts.csv", "--model", "bekker", "--out", "run").code == 0
+def test_effects_are_of_a_diagnosis_alone(calib: Calib, run: Path) -> None:
     for option in (("--effects", "mine.py"), ("--without", "force_offset")):
-        told = calib("predict", "run", "--at", "ruts.csv", *option)
+        told = calib("predict", run, "--at", "my.csv", *option)
         assert_refused(told, ["there is no diagnosis, which alone has effects", "run"])
 
 
@@ -152,17 +150,19 @@ def test_what_comes_of_reconstructed_data_says_so(calib: Calib) -> None:
             assert {row["data_label"] for row in csv.DictReader(text)} == {"reconstructed"}
     rut = "mine.csv"
     Path("gaps/plain_bekker/lab.csv").rename(rut)
-    fitted = calib("fit", rut, "--model", "bekker", "--out", "fit", "--json")
+    few = ("--max-steps", 100, "--workers", 1)
+    fitted = calib("fit", rut, "--model", "bekker", "--out", "fit", "--json", *few)
     assert said in fitted.err
     assert json.loads(fitted.out)["data_label"] == "reconstructed"
-    compared = calib("compare", "bekker", "modified_bekker", rut, "--out", "both")
+    compared = calib("compare", "bekker", "modified_bekker", rut, "--out", "both", *few)
     assert said in compared.err
     assert said in Path("both/index.html").read_text()
     assert json.loads(Path("both/comparison.json").read_text())["data_label"] == "reconstructed"
-    assert said in calib("check", "fit").err
+    assert said in calib("check", "fit", "--quick").err
 
 
 def test_data_of_ones_own_are_called_nothing(calib: Calib) -> None:
     template = calib("template", "bekker", "--out", "own.csv")
     assert template.code == 0
-    assert "reconstructed" not in calib("fit", "own.csv", "--model", "bekker", "--out", "fit").err
+    fitted = calib("fit", "own.csv", "--model", "bekker", "--out", "fit", "--max-steps", 100)
+    assert "reconstructed" not in fitted.err

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from calib.cli.calibration import _give
+from calib.cli.prediction import _give
 
 
 def test_what_is_printed_is_the_file_that_is_written(

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.cli.gap import prepare_case
 from calib.cli.options import say, say_failed
+from calib.cli.prediction import prepare_case
 from calib.data import table_from_arrays
 from calib.errors import CalibError
 from calib.gap.case import Case

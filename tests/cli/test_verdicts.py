@@ -28,6 +28,7 @@ def soils(*factors: float) -> None:
                 out.writerow([*row[:rut], float(row[rut]) * factor, *row[rut + 1 :], name])
 
 
+@pytest.mark.usefixtures("_one_figure")
 def test_an_ignored_column_is_the_first_thing_that_fit_and_report_say(calib: Calib) -> None:
     soils(1.0, 0.6)
     ran = calib("fit", "my.csv", "--model", "modified_bekker", "--out", "run", *FEW)

@@ -70,8 +70,8 @@ def written(name: str) -> list[Path]:
 @cache
 def simulated() -> Path:
     folder = Path(SCRATCH.name) / "sbc"
-    settings = SamplerSettings(steps=100, max_steps=400)
-    score = run_sbc(folder, models=["bekker"], simulations=10, seed=2019, settings=settings)
+    settings = SamplerSettings(steps=100, max_steps=100)
+    score = run_sbc(folder, models=["bekker"], simulations=4, seed=2019, settings=settings)
     write_sbc(score, folder, asdict(settings), ["calib", "sbc"])
     return folder
 

@@ -80,6 +80,7 @@ def shape(line: str) -> str:
 @pytest.mark.parametrize(
     "page", [p for p, found in BLOCKS.items() if any(b.language in RUN for b in found)]
 )
+@pytest.mark.usefixtures("_one_figure")
 def test_a_page_does_what_it_says(page: str, run: Calib) -> None:
     follow(page, run, slow=False)
 
