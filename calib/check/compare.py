@@ -162,8 +162,8 @@ def _group_of(place: Place) -> str:
         owner, keys = f"{keys[1]}: ", keys[2:]
     elif file != RUN:
         return file if file in (MANIFEST, SUMMARY) else file.partition(".")[0]
-    drawn = ("posterior", "prior_sensitivity", "validation", "sampling", "gate", "mode")
-    drawn += ("log_evidence", "efficiency", "acceptance", "evaluations")
+    drawn = {"posterior", "prior_sensitivity", "validation", "sampling", "gate", "mode"}
+    drawn |= {"log_evidence", "efficiency", "acceptance", "evaluations"}
     if keys and keys[0] in ("estimates", "fit", "by_pressure"):
         return f"{owner}estimates"
     if keys and keys[0] in drawn:

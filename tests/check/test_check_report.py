@@ -19,9 +19,6 @@ from calib.check.check import check
 from calib.check.compare import Status
 from calib.errors import CalibError
 from calib.inference.prior_files import default_priors
-from calib.inference.sampler import SamplerSettings
-from calib.report.sections import work_out
-from calib.report.writer import write_report
 from tests.check.conftest import (
     different,
     edit_json,
@@ -32,7 +29,7 @@ from tests.check.conftest import (
     seal,
     swap_figures,
 )
-from tests.check.made import rut_study, rut_tasks, write
+from tests.check.made import rut_study, write
 
 pytestmark = pytest.mark.usefixtures("computed_once")
 
@@ -57,12 +54,13 @@ def test_an_untouched_report_is_the_same_bit_for_bit(report_here: Path) -> None:
     assert {p: p.read_bytes() for p in report_here.rglob("*") if p.is_file()} == before
 
 
-def test_the_same_report_of_a_posterior_that_did_not_converge(tmp_path: Path) -> None:
-    short = SamplerSettings(steps=40, max_steps=40)
-    found = work_out(rut_tasks(), 3, settings=short)
-    write_report(found, tmp_path / "r", settings=short, command=["calib"], title="A report")
-    outcome = check(tmp_path / "r")
-    assert outcome.verdict.startswith("SAME, bit for bit")
+def test_a_report_repeats_that_a_posterior_did_not_converge(report: Path) -> None:
+    sampling = {"converged": False}
+    edit_json(
+        report / "summary.json", lambda s: s["models"]["rut_depth"]["sampling"].update(sampling)
+    )
+    seal(report)
+    outcome = check(report, quick=True)
     assert outcome.verdict.endswith("; NOT CONVERGED, not to be used: modified_bekker")
     assert outcome.document()["not_converged"] == ["modified_bekker"]
 
