@@ -134,6 +134,30 @@ def test_the_moves_leave_the_posterior_as_it_is(
     assert_normal(chain[steps // 3 :].transpose(1, 0, 2), exact.mean, exact.covariance)
 
 
+def test_importance_sampling_from_the_fitted_proposal(
+    problem: Problem, exact: Exact, proposal
+) -> None:
+    n = 20_000
+    t, log_q = proposal.draw(np.random.default_rng(6), n)
+    log_weight = problem.log_prob(t) - log_q
+    weight = np.exp(log_weight - exact.log_evidence)
+    # Normalised by the exact evidence, weights have mean one.
+    assert abs(weight.mean() - 1.0) < SIGMAS * weight.std() / np.sqrt(n)
+    z = np.linalg.solve(np.linalg.cholesky(exact.covariance), (t - exact.mean).T)
+    for value in (*z, *(z**2 - 1.0), z[0] * z[1]):
+        product = weight * value
+        assert abs(product.mean()) < SIGMAS * product.std() / np.sqrt(n)
+
+
+def test_the_mode_is_the_mean(problem: Problem, exact: Exact) -> None:
+    (mode,) = find_modes(problem.log_prob, problem.priors, np.random.default_rng(1))
+    sd = np.sqrt(np.diag(exact.covariance))
+    assert np.all(np.abs(mode.t - exact.mean) < 1e-3 * sd)
+    np.testing.assert_allclose(
+        mode.covariance / np.outer(sd, sd), exact.covariance / np.outer(sd, sd), atol=2e-3
+    )
+
+
 @pytest.mark.parametrize(
     ("estimator", "tolerance"),
     [

@@ -11,9 +11,12 @@ from calib.inference.diagnostics import (
     GateReport,
     convergence,
     distances,
+    ess,
+    hdi,
     hdi_error,
     judge,
     longest_autocorrelation_time,
+    mcse,
     median_error,
     power_scaled_weights,
     power_sensitivity,
@@ -172,6 +175,35 @@ def test_three_steps_say_nothing() -> None:
     assert np.isnan(convergence(good(steps=3))).all()
 
 
+def test_effective_sizes_and_r_hat_in_closed_form() -> None:
+    rng = np.random.default_rng(5)
+    rho, n = 0.8, 5000
+    noise = rng.standard_normal((8, n))
+    x = np.zeros((8, n))
+    x[:, 0] = noise[:, 0] / np.sqrt(1 - rho**2)
+    for i in range(1, n):
+        x[:, i] = rho * x[:, i - 1] + noise[:, i]
+    size = float(ess(x[..., None], "mean")[0])
+    # n (1 - rho)/(1 + rho) = 4444; the estimate varies by several percent.
+    assert size == pytest.approx(8 * n * (1 - rho) / (1 + rho), rel=0.25)
+    y = rng.standard_normal((4, 1, 4000, 1))
+    y[0] += 2.0
+    # The means spread by sd 1 about their mean (0, 0, 0, 2): R-hat near sqrt(1 + 1) = 1.41, less
+    # what ranking takes off.
+    assert 1.2 < convergence(y)[0][0] < 1.5
+
+
+def test_errors_of_independent_draws_are_the_textbooks() -> None:
+    """Of n normal draws the mean errs by s / sqrt n, the sd by s / sqrt 2n, the median more."""
+    chains = np.random.default_rng(7).normal(0.0, [2.0, 5.0], (4, 5000, 2))
+    mean, sd, median = (mcse(chains, method) for method in ("mean", "sd", "median"))
+    root = np.array([2.0, 5.0]) / np.sqrt(20_000)
+    # Of the effective size, estimated over some dozen lags, and of a density: some percent.
+    np.testing.assert_allclose(mean, root, rtol=0.1)
+    np.testing.assert_allclose(sd, root / np.sqrt(2.0), rtol=0.1)
+    np.testing.assert_allclose(median, root * np.sqrt(np.pi / 2.0), rtol=0.2)
+
+
 def test_errors_are_the_scatter_of_parts_over_a_root_of_their_number() -> None:
     """Parts that differ by a shift alone; the ends of an interval go with the cube root."""
     shifts = np.array([0.0, 1.0, 3.0, 4.0, 4.5, 6.0, 6.5, 7.0])
@@ -179,6 +211,13 @@ def test_errors_are_the_scatter_of_parts_over_a_root_of_their_number() -> None:
     scatter = float(shifts.std(ddof=1))
     np.testing.assert_allclose(hdi_error(parts, 0.9), [scatter / 2.0, scatter / 2.0])
     assert median_error(parts) == pytest.approx(scatter / np.sqrt(8.0))
+
+
+def test_the_highest_density_interval_of_a_skewed_distribution() -> None:
+    low, high = hdi(np.random.default_rng(7).exponential(size=40_000), 0.9)
+    assert low == pytest.approx(0.0, abs=1e-3)
+    # -ln 0.1, with a quantile's error of sqrt(0.1 x 0.9/40000)/0.1 = 0.015.
+    assert high == pytest.approx(np.log(10.0), abs=0.075)
 
 
 @pytest.mark.parametrize("k", [0.2, 0.5, 1.0])

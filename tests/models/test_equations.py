@@ -202,6 +202,16 @@ def test_conditions_may_differ_between_parameter_vectors(name: str) -> None:
         np.testing.assert_allclose(together[i], alone[0], rtol=1e-12)
 
 
+def test_a_pressure_of_its_own_for_every_vector_and_shared_slips() -> None:
+    bound, theta, conditions = draw(9, "magic_formula_pressure")
+    psi = np.random.default_rng(1).uniform(18.0, 42.0, (3, 5))
+    mixed = {"slip_ratio": conditions["slip_ratio"], "inflation_pressure_psi": psi}
+    together = bound.predict(theta, mixed)
+    for i in range(3):
+        alone = bound.predict(theta[i], mixed | {"inflation_pressure_psi": psi[i]})
+        np.testing.assert_allclose(together[i], alone[0], rtol=1e-12)
+
+
 @pytest.mark.parametrize("name", MODELS)
 def test_binding_takes_the_references_from_the_data(name: str) -> None:
     _, _, conditions = draw(11, name)

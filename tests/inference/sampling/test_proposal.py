@@ -12,6 +12,7 @@ from calib.inference.proposal import (
     StudentT,
     TriangularMap,
     adapt,
+    fit_mixture,
     refit,
 )
 from tests.inference.sampling.closed_form import linear
@@ -70,6 +71,15 @@ def test_the_map_is_one_to_one_and_its_jacobian_its_own(d: int) -> None:
         assert abs(np.corrcoef(first, second**2)[0, 1]) < 0.1
 
 
+def test_two_clusters_are_found_with_their_shares() -> None:
+    rng = np.random.default_rng(5)
+    left = rng.random(4000) < 0.25
+    x = rng.standard_normal((4000, 2)) + np.where(left, -8.0, 8.0)[:, None] * [1.0, 0.0]
+    shares, components = fit_mixture(x, np.full(4000, 1 / 4000), 4000.0, rng)
+    share = sum(w for w, c in zip(shares, components, strict=True) if c.mean[0] < 0.0)
+    assert abs(share - left.mean()) < 0.01
+
+
 @pytest.mark.parametrize("log_prob", [banana, two_modes])
 def test_draws_come_with_their_density(log_prob) -> None:
     """E[p/q] = 1 under the proposal q for a normal density p in its bulk."""
@@ -102,6 +112,13 @@ def test_the_evidence_of_a_conjugate_model(known: bool) -> None:
     _, found = adapted(log_prob, np.zeros(3 if known else 4))
     assert found.efficiency > 0.3
     assert abs(found.log_evidence - exact) < error_of(found.efficiency)
+
+
+def test_a_bend_is_followed() -> None:
+    """A single normal of the banana's moments has an efficiency near 0.2."""
+    _, found = adapted(banana, np.zeros(2))
+    assert found.efficiency > 0.35
+    assert abs(found.log_evidence) < error_of(found.efficiency)
 
 
 @pytest.mark.parametrize("seed", range(3))
