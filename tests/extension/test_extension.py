@@ -95,6 +95,30 @@ def test_a_new_output_its_model_and_its_effect_go_through_every_verb(run: Calib)
     assert "could not be drawn" not in Path("gap/index.html").read_text()
 
 
+def test_a_condition_that_the_simulator_ignores_is_named_as_the_cause(run: Calib) -> None:
+    rng = np.random.default_rng(4)
+    slip = np.linspace(0.02, 0.6, 20)
+
+    def rows(load: np.ndarray) -> str:
+        pull = 1.5 * (1.0 - np.exp(-slip / 0.1)) * (load / 5.0) ** 0.7
+        pull = pull + 0.02 * rng.standard_normal(slip.size)
+        lines = [f"{s:.3f},{w:g},{p:.4f}" for s, w, p in zip(slip, load, pull, strict=True)]
+        return "slip_ratio,normal_load_kn,drawbar_pull_kn\n" + "\n".join(lines) + "\n"
+
+    Path("case").mkdir()
+    Path("case/lab.csv").write_text(rows(np.full(20, 5.0)))
+    Path("case/field.csv").write_text(rows(np.resize([3.0, 5.0, 8.0], 20)))
+    Path("case/fresh.csv").write_text("slip_ratio,normal_load_kn\n0.2,5\n0.3,8\n")
+    Path("case/case.toml").write_text(
+        'calibration = "lab.csv"\nfield = "field.csv"\npredict = "fresh.csv"\n'
+        '[models]\ndrawbar_pull = "magic_formula"\n'
+    )
+    mine = ["--models", own("load_sensitivity.py")]
+    found = run("diagnose", "case", *mine, "--out", "gap", "--workers", 1)
+    assert found.code == 0, found.err
+    assert "load_sensitivity" in found.out.splitlines()[1]
+
+
 def test_a_plain_function_is_a_model() -> None:
     def straight(theta: np.ndarray, conditions) -> np.ndarray:
         return theta[:, :1] + theta[:, 1:2] * conditions["slip_ratio"]

@@ -5,7 +5,11 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+import socket
+import subprocess
 import sys
+import time
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -141,6 +145,24 @@ def test_a_report_and_its_check(run: Calib) -> None:
     assert checked.out.startswith("SAME")
 
 
+@pytest.mark.slow
+def test_simulators_are_compared(run: Calib) -> None:
+    """Two that say the same of other parameters cannot be told apart."""
+    own: list[object] = []
+    for name, extra in (("wheel", ""), ("twin", "p['s0'] *= 2")):
+        Path(name).mkdir()
+        own += ["--simulator", write_program(Path(name), name=f'"{name}"', extra=extra)]
+    write_table("lab.csv", lab(np.random.default_rng(1)))
+    made = run("compare", "wheel", "twin", "lab.csv", *own, "--out", "c", "--workers", 1, *FEW)
+    assert made.code == 0, made.err
+    assert "twin: emulated from" in made.out
+    assert "The data cannot tell" in made.out
+    checked = run("check", "c", *own, "--workers", 1)
+    assert checked.code == 0, checked.out
+    told = run("predict", "c", "--at", "lab.csv", *own, "--out", "bands.csv")
+    assert told.code == 0, told.err
+
+
 def test_a_data_folder_runs_no_command(run: Calib) -> None:
     Path("case").mkdir()
     write_program(Path("case"), extra="open('/dev/null'); open('ran', 'w')")
@@ -155,10 +177,123 @@ def test_a_data_folder_runs_no_command(run: Calib) -> None:
     assert not (Path("case") / "wheel.runs").exists()
 
 
+C_PROGRAM = r"""
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+/* reads: mu s0 n, then n rows of slip and load; writes the pull as CSV */
+int main(int argc, char **argv) {
+  double mu, s0, s[512], w[512]; char line[256]; int n = 0;
+  FILE *in = argc > 2 ? fopen(argv[1], "r") : NULL, *out;
+  if (!in) { fprintf(stderr, "no input\n"); return 2; }
+  if (!fgets(line, sizeof line, in)) return 3;
+  while (n < 512 && fscanf(in, "%lf,%lf,%lf,%lf", &mu, &s0, &s[n], &w[n]) == 4) n++;
+  fclose(in);
+  if (!(out = fopen(argv[2], "w"))) return 4;
+  fprintf(out, "row,pull\n");
+  for (int i = 0; i < n; i++)
+    fprintf(out, "%d,%.12g\n", i, 1000 * w[i] * mu * (1 - exp(-s[i] / 100 / s0)));
+  fclose(out);
+  return n ? 0 : 5;
+}
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler (cc)")
+def test_a_compiled_program_from_file_to_verdict(run: Calib) -> None:
+    Path("wheel.c").write_text(C_PROGRAM)
+    subprocess.run(["cc", "-O2", "-o", "wheel", "wheel.c", "-lm"], check=True)
+    file = write_program(
+        Path.cwd(), run='"./wheel {input} {output}"', input='"csv"', output='"csv"'
+    )
+    own = ["--simulator", file]
+    write_table("lab.csv", lab(np.random.default_rng(3)))
+    write_table("field.csv", field(np.random.default_rng(4)))
+    fitted = run("fit", "lab.csv", "--model", "wheel", *own, "--out", "run", "--workers", 1, *FEW)
+    assert fitted.code == 0, fitted.err
+    check_folder(Path("run"), overwrite=True)
+    same_posterior("run", exact("lab.csv"))
+    found = run("diagnose", "--run", "run", "--field", "field.csv", *own, "--out", "gap",
+                "--workers", 1)  # fmt: skip
+    assert found.code == 0, found.err
+    assert "slip_zero_shift" in found.out.splitlines()[2]
+
+
+SERVER = """
+import math
+import umbridge
+
+class Wheel(umbridge.Model):
+    def __init__(self): super().__init__("forward")
+    def get_input_sizes(self, config): return [2]
+    def get_output_sizes(self, config): return [len(config.get("s", [0]))]
+    def supports_evaluate(self): return True
+    def __call__(self, parameters, config):
+        (mu, s0), = parameters
+        rows = zip(config["s"], config["w"])
+        return [[1000 * w * mu * (1 - math.exp(-s / 100 / s0)) for s, w in rows]]
+
+umbridge.serve_models([Wheel()], PORT)
+"""
+
+
+@pytest.mark.slow
+def test_a_model_behind_a_server(run: Calib) -> None:
+    pytest.importorskip("umbridge", reason="there is no umbridge to serve a model with")
+    port = _free_port()
+    Path("server.py").write_text(SERVER.replace("PORT", str(port)))
+    server = subprocess.Popen(
+        [sys.executable, "server.py"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    try:
+        _wait_for(f"http://127.0.0.1:{port}/Info", server)
+        file = write_program(
+            Path.cwd(), run="", url=f'"http://127.0.0.1:{port}"', model='"forward"', limit="20"
+        )
+        write_table("lab.csv", lab(np.random.default_rng(5)))
+        fitted = run("fit", "lab.csv", "--model", "wheel", "--simulator", file, "--out", "run",
+                     "--workers", 1, *FEW)  # fmt: skip
+    finally:
+        server.kill()
+        server.wait()
+    assert fitted.code == 0, fitted.err
+    check_folder(Path("run"), overwrite=True)
+    same_posterior("run", exact("lab.csv"))
+    # With the server gone the message says so, and the runs that were made are kept.
+    kept = len(list(Path("wheel.runs").rglob("*-0.json")))
+    write_table("lab.csv", {k: v[:12] for k, v in lab(np.random.default_rng(5)).items()})
+    refused = run("fit", "lab.csv", "--model", "wheel", "--simulator", file, "--out", "run2",
+                  "--workers", 1)  # fmt: skip
+    assert refused.code == 2
+    assert "is not there" in refused.err
+    assert len(list(Path("wheel.runs").rglob("*-0.json"))) == kept
+
+
+def _free_port() -> int:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
+
+
+def _wait_for(url: str, server: subprocess.Popen[bytes]) -> None:
+    for _ in range(200):
+        assert server.poll() is None, "the server has ended"
+        try:
+            urllib.request.urlopen(url, timeout=1.0).close()
+        except OSError:
+            time.sleep(0.1)
+        else:
+            return
+    raise AssertionError("the server does not answer")
+
+
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "chrono_scm"
 # Stands for a program around Chrono: it reads the soil in the order of SetSoilParameters.
 PROGRAM = """#!{python}
 import sys
+import time
+import urllib.request
 lines = [line.split() for line in open(sys.argv[1]) if not line.startswith("#")]
 values = {{name: [float(v) for v in rest] for name, *rest in lines}}
 assert [line[0] for line in lines][:6] == [
