@@ -11,6 +11,7 @@ from scipy import stats
 
 from calib.data import Table
 from calib.errors import CalibError
+from calib.inference.diagnostics import ess
 from calib.inference.mode import find_modes
 from calib.inference.problem import build_problem
 from calib.inference.proposal import Guess
@@ -21,8 +22,9 @@ from calib.inference.sampler import (
     sample_density,
     sample_posterior,
 )
-from tests.custom_problems import normal, problem_of
+from tests.custom_problems import fixed, normal, problem_of
 from tests.inference.sampling.closed_form import (
+    SIGMAS,
     assert_distributed,
     evidence_error,
     linear,
@@ -36,6 +38,21 @@ QUICK = SamplerSettings(walkers=32, steps=50, max_steps=50, keep=50)
 def slow(*case: float):
     """One more case of the same, for `make test-slow`."""
     return pytest.param(*case, marks=pytest.mark.slow)
+
+
+def test_a_normal_posterior_with_known_noise() -> None:
+    model = linear()
+    draws = run(model.log_prob_known, np.zeros(3), np.eye(3))
+    assert draws.report.passed
+    for i in range(3):
+        assert_distributed(draws, lambda t, i=i: t[:, i], model.marginal_known(i))
+    exact = np.linalg.inv(model.precision)
+    size = draws.report.ess_bulk.min()
+    scale = np.sqrt(np.outer(np.diag(exact), np.diag(exact)))
+    # The sd of a sample covariance of normals is at most sqrt(2/size) of the product of sds.
+    error = np.abs(np.cov(draws.flat.T) - exact) / scale
+    assert error.max() < 5.0 * np.sqrt(2.0 / size)
+    assert abs(draws.log_evidence - model.log_evidence_known()) < 5.0 * evidence_error(draws)
 
 
 def test_an_unknown_noise_scale() -> None:
@@ -155,11 +172,40 @@ def on_ridge(d: int, thinness: float, max_steps: int) -> Draws:
     return run(ridge(thinness), np.zeros(d), covariance, settings=settings)
 
 
+@pytest.mark.slow
+def test_an_attempt_that_fails_teaches_the_next() -> None:
+    first, whole = (on_ridge(4, 0.3, steps) for steps in (200, 1600))
+    assert not first.report.passed
+    assert whole.report.passed
+    assert whole.efficiency > first.efficiency
+    assert_distributed(whole, lambda t: t[:, 0], stats.norm())
+    assert_distributed(whole, lambda t: t[:, 3] - 0.5 * t[:, 0] ** 2, stats.norm(0.0, 0.3))
+
+
 @pytest.mark.parametrize(("d", "thinness"), [(2, 0.05), slow(4, 0.1), slow(7, 0.3)])
 def test_thin_bent_ridges_come_out_right_or_are_refused(d: int, thinness: float) -> None:
     draws = on_ridge(d, thinness, 400)
     if draws.report.passed:
         assert_distributed(draws, lambda t: t[:, 0], stats.norm())
+
+
+def test_distant_modes_come_out_in_their_proportions() -> None:
+    """A square tells no sign: modes 80 sd apart, which no local move ever crosses."""
+    slip = np.linspace(0.0, 0.2, 12)
+    pull = 4.0 + 0.05 * np.random.default_rng(3).standard_normal(12)
+    priors = (normal("a", 0.4, 2.0), fixed("sigma", 0.05))
+    problem = problem_of(lambda a, x: a * a + 0.0 * x, priors, slip, pull)
+    draws = sample_posterior(problem, 0)
+    assert draws.report.passed
+    grid = np.concatenate([np.linspace(-2.1, -1.9, 4001), np.linspace(1.9, 2.1, 4001)])[:, None]
+    density = np.exp(problem.log_prob(grid) - problem.log_prob(grid).max())
+    exact = density[4001:].sum() / density.sum()
+    right = (draws.flat[:, 0] > 0.0).astype(float)
+    ensembles, walkers, steps, _ = draws.t.shape
+    size = float(ess(right.reshape(ensembles * walkers, steps, 1), "mean")[0])
+    assert abs(right.mean() - exact) < SIGMAS * np.sqrt(exact * (1.0 - exact) / size)
+    ln_evidence = np.log(density.sum() * 5e-5) + problem.log_prob(grid).max()
+    assert abs(draws.log_evidence - ln_evidence) < SIGMAS * evidence_error(draws)
 
 
 def test_a_run_extends_itself_until_the_gate_passes() -> None:
