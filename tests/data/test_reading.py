@@ -13,6 +13,8 @@ from syrupy.assertion import SnapshotAssertion
 from calib.data import read_table, table_from_arrays, write_table
 from calib.errors import CalibError
 
+SHARED = Path(__file__).resolve().parents[3] / "shared"
+
 GOOD = (
     "slip_percent,inflation_pressure_kpa,drawbar_pull_n,operator\n10,124.1,900,A\n20,206.8,950,B\n"
 )
@@ -285,6 +287,16 @@ def test_a_large_file_is_read_without_its_text(tmp_path: Path) -> None:
     assert np.array_equal(table["slip_ratio"], slips)
     assert np.array_equal(table["repeat"], np.arange(n) % 3)
     assert (table.text, table.lines[-1]) == ((), n + 1)
+
+
+@pytest.mark.skipif(not SHARED.exists(), reason="the measured data are not in the repository")
+def test_measured_data_are_read() -> None:
+    needed = ["cone_index_kpa", "gravimetric_water_content", "bulk_density_g_cm3"]
+    table = read_table(SHARED / "data" / "soil_skp1994.csv", required=needed)
+    assert table["cone_index_kpa"][0] == 230.0
+    assert table.ignored == ("matric_suction_cm",)
+    for path in sorted((SHARED / "cases").glob("*/*.csv")):
+        assert read_table(path).ignored == ()
 
 
 def test_a_table_is_written_whole_or_not_at_all(tmp_path: Path) -> None:

@@ -51,6 +51,14 @@ def test_summaries_are_those_of_the_draws(calibration: Calibration) -> None:
         assert s.mcse_mean == pytest.approx(s.sd / np.sqrt(size))
 
 
+@CALIBRATIONS
+def test_published_parameters_follow_from_the_sampled(calibration: Calibration) -> None:
+    bound = calibration.problem.bound
+    natural = calibration.natural[3, 7, :-1]
+    reported = {name: float(v[3, 7]) for name, v in calibration.reported.items()}
+    np.testing.assert_allclose(bound.theta(reported), natural, rtol=1e-6, atol=1e-9)
+
+
 def test_what_the_data_do_not_say_is_set_by_the_prior(pull_calibration: Calibration) -> None:
     """Two pressures cannot determine a curvature, but they do determine the ends."""
     ratio = {name: s.sd_ratio for name, s in pull_calibration.summary.items()}

@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from calib.data import Table, table_from_arrays
+from calib.data import Table, read_for_model, table_from_arrays
 from calib.errors import CalibError
 from calib.gap.campaigns import campaigns
 from calib.gap.case import case_from_run
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.emulation.prepared import emulated
-from calib.inference.estimators import estimate
+from calib.inference.estimators import estimate, methods_for
 from calib.inference.io import load_calibration, save_calibration
 from calib.inference.likelihood import Noise
 from calib.inference.prior_files import default_priors, parse_priors
 from calib.inference.problem import Problem, build_problem
 from calib.inference.sampler import SamplerSettings
-from calib.models import get_model
+from calib.models import MODELS, example_csv, get_model
 from calib.validation.prediction import predict, predictive_draws
 from tests.conftest import SEED, he2019_table
 from tests.gap.cases import make_case
@@ -222,6 +222,35 @@ def test_a_noise_cannot_depend_on_what_is_the_same_everywhere(tmp_path: Path) ->
 def test_an_effect_has_no_likelihood() -> None:
     with pytest.raises(CalibError, match="an effect has no likelihood"):
         parse_priors(f'model = "an_effect"\n{STUDENT}', "my.toml", "an_effect", ("size",), {})
+
+
+def twice(name: str, folder: Path) -> Path:
+    """An example's rows and as many with all 2 % larger: more than parameters, noise and all."""
+    header, *rows = example_csv(name).splitlines()
+    again = [",".join(f"{1.02 * float(cell):.6g}" for cell in row.split(",")) for row in rows]
+    path = folder / "rows.csv"
+    path.write_text("\n".join([header, *rows, *again, ""]), encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("name", ["magic_formula", "modified_bekker", "brixius"])
+def test_every_model_and_estimator_takes_another_noise(name: str, tmp_path: Path) -> None:
+    model = MODELS[name]
+    path = twice(name, tmp_path)
+    table = read_for_model(path, (*model.conditions, model.output))
+    varying = next(c for c in model.conditions if np.ptp(table[c]) > 0.0)
+    chosen = STUDENT + f'noise_depends_on = "{varying}"\n'
+    problem, usual = problem_with(tmp_path, chosen, table, name), build_problem(name, table)
+    assert problem.names == (*usual.names[:-1], "nu", "sigma_slope", "sigma")
+    assert np.isfinite(problem.log_prob(drawn(problem, 3))).all()
+    # What minimises squares knows no noise.
+    for method in set(methods_for(name)) - {"genetic"}:
+        try:
+            expected = estimate(usual, method, np.random.default_rng(1))
+        except CalibError:  # a method that reads features off curves needs more rows
+            continue
+        found = estimate(problem, method, np.random.default_rng(1))
+        np.testing.assert_allclose(found.theta, expected.theta)
 
 
 def test_an_emulator_and_a_diagnosis_refuse_another_noise(

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from calib.data import Table, table_from_arrays
+from calib.data import Table, read_table, table_from_arrays
 from calib.errors import CalibError
 from calib.inference.prior_files import DeclaredPriors, default_priors
 from calib.inference.problem import build_problem
+
+FIELD = Path(__file__).resolve().parents[3] / "shared" / "field"
 
 SLIP = np.linspace(0.0, 0.9, 15)
 # Of a wheel under 1 kN.
@@ -81,3 +84,12 @@ def test_one_slip_of_the_pen_is_no_wrong_scale() -> None:
     build_problem(
         "magic_formula", replace(table, columns={**table.columns, "drawbar_pull_kn": pull})
     )
+
+
+@pytest.mark.skipif(not FIELD.is_dir(), reason="the shared field files are not here")
+def test_the_field_file_of_a_small_wheel_without_its_load() -> None:
+    with pytest.raises(CalibError, match="add the column normal_load_kn"):
+        build_problem("magic_formula", read_table(FIELD / "rover_no_load.csv"))
+    with pytest.raises(CalibError, match="the column normal_load_kn"):
+        build_problem("magic_formula", read_table(FIELD / "rover_no_load_unchecked.csv"))
+    assert not build_problem("magic_formula", read_table(FIELD / "rover_with_load.csv")).notes

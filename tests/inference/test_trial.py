@@ -15,7 +15,7 @@ from calib.inference.design import try_simulator
 from calib.inference.random import generator
 from calib.models import MODELS
 from calib.models.simulators.declaration import SIMULATED
-from tests.models.simulators.examples import PRIORS, lab, pull, write_program
+from tests.models.simulators.examples import PRIORS, lab, pull, serving, write_program
 from tests.registered import forgotten
 
 # At the middle of the prior and at five points spread over it, each tried again once.
@@ -69,6 +69,25 @@ def test_a_command_says_file_and_key_and_what_it_printed(
     problem = problem_of(write_program(tmp_path, extra=counted, **QUICK))
     refused(problem, f"wheel.toml, {key}: ", *words, asking=(sampled,))
     assert len((tmp_path / "made").read_text()) == MADE
+
+
+@pytest.mark.parametrize(
+    ("mood", "key", "words"),
+    [
+        ("error", "url", ["the server reports an error", "no soil"]),
+        ("more", "outputs", ["2 output vectors for pull"]),
+    ],
+)
+def test_a_server_says_file_and_key(tmp_path: Path, mood: str, key: str, words: list[str]) -> None:
+    with serving() as url:
+        file = write_program(
+            tmp_path, run="", url=f'"{url}"', model=f'"{mood}"', rows='"each"', limit="20", **QUICK
+        )
+        problem = problem_of(file)
+        refused(problem, f"wheel.toml, {key}: ", *words)
+    said = r"wheel.toml, url: the run could not be made: the server at .* is not there"
+    with pytest.raises(CalibError, match=said):
+        calib.calibrate(problem, seed=1)
 
 
 def of_function(f: Callable, **changes: object) -> calib.Problem:

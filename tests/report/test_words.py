@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 from calib.data.quantities import QUANTITIES, Quantity
 from calib.inference.calibration import Calibration, ParameterSummary
-from calib.inference.diagnostics import hdi
+from calib.inference.diagnostics import hdi, hdi_error, median_error
+from calib.report.figures.posterior import _log_ticks
 from calib.report.labels import (
     axis_of,
     joined,
@@ -254,6 +255,20 @@ def test_how_a_posterior_is_written(s, errors, centre, interval):
     assert interval_text(s) == interval
 
 
+@pytest.mark.parametrize("kind", ["normal", "lognormal"])
+def test_monte_carlo_errors_are_those_of_repeated_sampling(kind):
+    rng = np.random.default_rng(3)
+    draws = rng.standard_normal((150, 16, 250))
+    draws = np.exp(draws) if kind == "lognormal" else draws
+    ends = np.array([hdi(d.ravel(), 0.95) for d in draws])
+    stated = np.array([hdi_error(d, 0.95) for d in draws]).mean(axis=0)
+    actual = ends.std(axis=0)
+    assert (stated > 0.8 * actual).all()
+    assert (stated < 2.0 * actual).all()
+    medians = np.median(draws.reshape(150, -1), axis=1).std()
+    assert np.mean([median_error(d) for d in draws]) == pytest.approx(medians, rel=0.2)
+
+
 def test_every_parameter_of_a_calibration_has_its_errors(rut_calibration: Calibration):
     ensembles = rut_calibration.draws.t.shape[0]
     for name, s in rut_calibration.summary.items():
@@ -332,3 +347,11 @@ def test_temperatures_have_the_sign_of_degrees():
 ])  # fmt: skip
 def test_a_range_has_a_value_wherever_it_is_said_to(values, said):
     assert axis_of("slip_ratio").range_text(np.asarray(values)) == said
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.02, 1.5), (1e-5, 0.3), (8.0, 12.0), (1e-9, 1e3)])
+def test_log_ticks_lie_inside_and_are_few(low, high):
+    ticks = _log_ticks(low, high)
+    assert len(ticks) <= 4
+    assert all(low <= v <= high for v in ticks)
+    assert ticks

@@ -126,6 +126,19 @@ def test_ends_at_the_least_squares_optimum(table_4, seed):
     assert found.converged
 
 
+def test_no_worse_than_differential_evolution_run_to_its_end(table_4):
+    problem, cost = table_4
+    genetic, de = [], []
+    for seed in range(2):
+        genetic.append(estimate(problem, "genetic", np.random.default_rng(seed)))
+        de.append(
+            estimate(problem, "differential_evolution", np.random.default_rng(seed), polish=False,
+                     tol=1e-10)
+        )  # fmt: skip
+    assert max(e.cost for e in genetic) <= min(e.cost for e in de) * (1.0 + 1e-9)
+    assert max(e.cost for e in genetic) == pytest.approx(cost, rel=1e-9)
+
+
 def test_box_restarts_and_polish(table_4):
     problem, cost = table_4
     rng = np.random.default_rng(0)

@@ -130,6 +130,17 @@ def _ends(pid: int) -> bool:
     return False
 
 
+def test_what_the_kernel_cannot_end_is_not_waited_for_for_ever(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+    stuck = SimpleNamespace(kill=lambda: asked.append(1))
+    monkeypatch.setattr("calib.models.simulators.process._marked", lambda mark: [stuck])
+    monkeypatch.setattr("calib.models.simulators.process.KILL_SECONDS", 0.2)
+    assert run_program(python("print('done')"), tmp_path, 20.0) == "done\n"
+    assert len(asked) > 1
+
+
 def hangs(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
     import subprocess
 
@@ -240,6 +251,20 @@ def test_what_cannot_be_handed_over_is_told() -> None:
 
     with pytest.raises(CalibError, match="cannot be handed to a process of its own"):
         simulator(CallableRunner(locked, ("pull",), limit=60.0)).run(THETA, X)
+
+
+def test_a_function_of_a_file_has_the_limit_that_the_file_gives(tmp_path: Path) -> None:
+    """The module of the file has no name that another process could import."""
+    (tmp_path / "own.py").write_text(
+        "import numpy as np\nSCALE = 1000.0\ndef pull(theta, x):\n"
+        "    return SCALE * x['w'] * theta[:, :1] * (1 - np.exp(-x['s'] / 100 / theta[:, 1:2]))\n"
+    )
+    for given, limit in (("60", 60.0), ("", None)):
+        file = write_program(tmp_path, run="", python='"own.py:pull"', limit=given)
+        runner = read_simulator(file).simulator.runner
+        assert isinstance(runner, CallableRunner)
+        assert runner.limit == limit
+        is_exact(simulator(runner).run(THETA, X))
 
 
 # As many parameter vectors as rows: what is transposed has the right shape.

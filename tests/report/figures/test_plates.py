@@ -18,8 +18,8 @@ from calib.report.figures.posterior import (
 from calib.report.figures.style import Plate, draw_all, style
 from calib.report.figures.validation import residuals_plate, validation_plate
 from calib.report.labels import axis_of, units_of
-from calib.report.rows import groups
-from calib.validation.scores import BOTH, DATA, MOVED, PRIOR, role_of
+from calib.report.rows import groups, signs_along
+from calib.validation.scores import BOTH, DATA, MOVED, PRIOR, role_of, standardise
 
 UNIT = re.compile(r"\(.+\)$")
 NAMES = ("bands", "validation", "prior_predictive", "learned", "corner", "ensembles", "residuals",
@@ -84,6 +84,17 @@ def test_in_the_units_of_a_file_the_same_is_drawn(request, key, headers):
                 ratio = factors[units[0]] / before[units[1]]
                 np.testing.assert_allclose(ends, ratio * before_ends, rtol=1e-6, atol=1e-9)
         assert changed or one is residuals_plate
+
+
+def test_nothing_is_cut_off(drawn):
+    # The most parameters and panels, and the longest tick labels.
+    for p in (*drawn["drawbar"].values(), drawn["density"]["bands"]):
+        inside = p.figure.bbox.padded(2.0)
+        for ax in p.figure.axes:
+            box = ax.get_tightbbox()
+            if ax.get_visible() and ax.axison and box is not None:
+                assert inside.x0 <= box.x0 <= box.x1 <= inside.x1, (p.name, box)
+                assert inside.y0 <= box.y0 <= box.y1 <= inside.y1, (p.name, box)
 
 
 def test_bands_show_each_point_once_and_count_what_they_cover(drawn, drawbar):
@@ -155,6 +166,15 @@ def test_captions_have_the_numbers(drawn, rut, density, unconverged):
 )  # fmt: skip
 def test_roles(ratio, moved, role):
     assert role_of(ratio, moved) == role
+
+
+def test_residuals_are_in_noise_sds(rut):
+    residual = standardise(rut.calibration, rut.calibration.problem).residual
+    assert residual.std() == pytest.approx(1.0, abs=0.25)
+    changes, pairs = signs_along(rut, residual)
+    assert pairs == 18 - 2
+    assert 0 <= changes <= pairs
+    assert signs_along(rut, np.ones(18)) == (0, 16)
 
 
 def test_many_pressures_are_cut_to_six_spread_out(drawbar):
