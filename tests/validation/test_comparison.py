@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -36,6 +37,7 @@ from calib.validation.prediction import predict, predict_stacked
 from calib.validation.validate import Validation, leave_one_out
 from tests.custom_problems import normal, problem_of
 
+SHARED = Path(__file__).resolve().parents[3] / "shared"
 # Where what is asked does not need many draws.
 FEW = SamplerSettings(steps=100, max_steps=100, gate=Gate(rhat_max=2, ess_min=0, taus_min=0))
 PLATE = ("average_ground_pressure_kpa", "plate_width_mm", "rut_depth_mm")
@@ -140,6 +142,32 @@ def test_a_stack_is_written_and_predicts(frictional: Comparison, tmp_path: Path)
     np.testing.assert_allclose(
         stacked.predictive.lower[0.9], plain.predictive.lower[0.9], rtol=0.04
     )
+
+
+@pytest.mark.slow
+def test_measured_plates_prefer_a_law_with_width() -> None:
+    """Sand of which the smaller plates sank deeper: kc is below zero, as published for sands."""
+    path = SHARED / "data" / "cmu_plate_sinkage.csv"
+    if not path.exists():
+        pytest.skip("the measured plate data are not here")
+    with path.open() as file:
+        measured = [r for r in csv.DictReader(file)
+                    if r["element"] == "plate" and r["container"] == "large"]  # fmt: skip
+    rows = []
+    # Readings along a run depend on each other: four of each, spread over it.
+    for run in sorted({r["run_id"] for r in measured}):
+        own = [r for r in measured if r["run_id"] == run and float(r["pressure_kPa"]) > 1.0]
+        rows += [own[i] for i in np.linspace(0, len(own) - 1, 4).round().astype(int)]
+    keys = ("pressure_kPa", "plate_diameter_m", "sinkage_corrected_m")
+    columns = [np.array([float(r[k]) for r in rows]) for k in keys]
+    table = table_from_arrays(
+        dict(zip(PLATE, (columns[0], 1e3 * columns[1], 1e3 * columns[2]), strict=True))
+    )
+    found = compare(table, ["bekker", "bekker_plate", "reece"], 7)
+    assert found.sound
+    assert found.candidates[0].model == "bekker_plate"
+    assert found.differences["bekker"].clear
+    assert found.candidates[0].calibration.summary["share"].hdi_upper < 0.0
 
 
 def test_no_shipped_model_is_chosen_for_the_papers_tables_but_its_own() -> None:
