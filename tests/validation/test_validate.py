@@ -11,10 +11,13 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 
 import calib.validation.validate as validate_module
-from calib.data import Table, table_from_arrays
+from calib.data import Table, hold_out, table_from_arrays
 from calib.errors import CalibError
+from calib.he2019.embedded import he2019_tasks
 from calib.inference.calibration import Calibration, calibrate
+from calib.inference.estimators import estimate
 from calib.inference.problem import build_problem
+from calib.inference.random import generator
 from calib.inference.sampler import SamplerSettings
 from calib.validation.scores import score
 from calib.validation.validate import (
@@ -250,3 +253,59 @@ def test_only_rows_at_the_edge_of_a_band_may_cross_it() -> None:
     errors = errors_of(draws, observed, ess=4000.0)
     assert 5.0 * errors["validation", "coverage", "90"] == pytest.approx(1 / 3)
     assert errors["validation", "coverage", "50"] == 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("output", ["bulk_density", "drawbar_pull", "rut_depth"])
+def test_numbers_of_other_seeds_move_by_their_errors(output: str) -> None:
+    """12 seeds: the spread of every number over its predicted error."""
+    task = next(t for t in he2019_tasks() if t.output == output)
+    held = task.held_out
+    rows, out = hold_out(task.table, held.column, held.value) if held else (task.table, None)
+    problem = build_problem(task.model, rows)
+    start = (estimate(problem, "least_squares", generator(1, "start")),)
+    values, errors = [], []
+    for seed in range(12):
+        calibration = calibrate(problem, seed, label=output, estimates=start)
+        validation = (
+            leave_one_out(calibration) if out is None else validate_held_out(calibration, out)
+        )
+        errors.append({
+            **posterior_errors(calibration), **validation_errors(calibration, validation, 7.0)
+        })  # fmt: skip
+        result = SimpleNamespace(calibration=calibration, validation=validation)
+        values.append(numbers_of(result))
+    judged = [
+        path for path, e in errors[0].items()
+        if e and path in values[0] and "coverage" not in path[1]
+        and not path[1].startswith(("n_relative", "coverage"))
+    ]  # fmt: skip
+    assert len(judged) > 30
+    ratio = {}
+    for path in judged:
+        predicted = [e[path] for e in errors if e[path] is not None]
+        ratio[path] = np.std([v[path] for v in values], ddof=1) / np.mean(predicted)
+    # Of 12 seeds an sd is known to a fifth; the tolerance has a factor of 1.5 for the rest.
+    found = np.array(list(ratio.values()))
+    assert np.median(found) == pytest.approx(0.95, abs=0.3)
+    assert found.max() < 2.2, max(ratio, key=lambda path: ratio[path])
+
+
+def numbers_of(result) -> dict[tuple[str, ...], float]:
+    s = result.validation.scores
+    found = {
+        ("validation", "rmse"): s.rmse,
+        ("validation", "crps"): s.crps,
+        ("validation", "max_relative_error"): s.max_relative_error,
+        ("validation", "elpd"): result.validation.elpd,
+        ("validation", "elpd_se"): result.validation.elpd_se,
+        ("sampling", "log_evidence"): result.calibration.draws.log_evidence,
+    }
+    found |= {("validation", "pit", str(i)): float(p) for i, p in enumerate(s.pit)}
+    for name, p in result.calibration.summary.items():
+        found |= {
+            ("posterior", name, key): getattr(p, key)
+            for key in ("mean", "sd", "median", "hdi_lower", "hdi_upper")
+        }
+        found["posterior", name, "posterior_to_prior_sd"] = p.sd_ratio
+    return found
