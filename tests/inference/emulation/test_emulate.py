@@ -80,6 +80,15 @@ def test_few_runs_give_the_posterior_of_three_hundred_thousand() -> None:
     agree(found, directly())
 
 
+@pytest.mark.slow
+def test_a_budget_that_is_too_small_is_told() -> None:
+    declared(lambda t, x: pull(t, x) * np.cos(25.0 * t[:, :1]), "wild", emulate=True, runs=30)
+    emulation = calib.emulated(calib.build_problem("wild", table()), seed=1)
+    assert not emulation.passed
+    assert "give it more runs" in emulation.reasons[0]
+    assert len(emulation.runs) <= 30
+
+
 def test_a_region_where_it_crashes_is_outside_the_posterior(tmp_path: Path) -> None:
     def crashing(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
         if theta[0, 0] > 0.6:
@@ -105,6 +114,42 @@ def test_a_region_where_it_crashes_is_outside_the_posterior(tmp_path: Path) -> N
     assert lines[0] == "mu,s0,kind,reason,printed"
     assert len(lines) == 1 + len(emulation.failed)
     assert "the mesh folds" in lines[1]
+
+
+CRASHES: dict[str, Callable[[float, float], bool]] = {
+    "at the posterior's edge": lambda mu, s0: mu > 0.6,
+    "on the posterior and beyond": lambda mu, s0: mu > 0.52,
+    "in half of the prior": lambda mu, s0: s0 < 0.085,
+    "on the posterior alone": lambda mu, s0: (
+        abs(np.log(mu / 0.6)) < 0.1 and abs(np.log(s0 / 0.08)) < 0.15
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("where", CRASHES)
+@pytest.mark.parametrize("seed", range(2))
+def test_whatever_fails_the_end_is_a_fit_or_what_to_do(where: str, seed: int) -> None:
+    def crashing(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+        if CRASHES[where](*theta[0]):
+            raise RuntimeError("the mesh folds")
+        return pull(theta, x)
+
+    declared(crashing, "crashing", emulate=True)
+    told = ""
+    try:
+        emulation = calib.emulated(calib.build_problem("crashing", table()), seed=seed)
+    except CalibError as error:
+        told = str(error)
+    if told:
+        for words in ("runs have a value", "the mesh folds", ", at mu ", "priors that do not"):
+            assert words in told
+        return
+    found = calib.calibrate(emulation.problem, seed=seed)
+    assert found.converged
+    theta = found.natural.reshape(-1, 3)[::50]
+    # To the distance between runs, draws keep to where there are values.
+    assert np.mean([CRASHES[where](*t[:2]) for t in theta]) < 0.5
 
 
 def test_where_runs_fail_and_what_to_do_is_told_if_nothing_is_left(
