@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import tomllib
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -13,10 +11,9 @@ import pytest
 
 import calib
 from calib.errors import CalibError
-from calib.inference.prior_files import default_priors
 from calib.inference.sampler import SamplerSettings
-from calib.models import MODELS, get_model
-from calib.models.simulators.declaration import SIMULATED, written
+from calib.models import MODELS
+from calib.models.simulators.declaration import SIMULATED
 from tests.inference.emulation.test_emulate import CONDITIONS, declared, table
 from tests.models.simulators.examples import PRIORS, pull
 from tests.registered import forgotten
@@ -133,50 +130,3 @@ def test_a_poor_emulator_says_what_it_is_good_for() -> None:
     for name, ratio in emulation.wider.items():
         assert ratio == pytest.approx(both[0][name].sd / both[1][name].sd, rel=0.15)
     assert set(emulation.shifted) == {"mu", "s0"}
-
-
-def wheel_of_nine() -> tuple[calib.Table, str]:
-    """A rigid wheel on soil of eight parameters, and a resistance: 24 rows and its priors."""
-    model = get_model("wong_reece_pull")
-    slip, load = np.meshgrid([0.03, 0.07, 0.12, 0.2, 0.3, 0.45], [1.5, 2.5, 3.5, 4.5])
-    x = {
-        "slip_ratio": slip.ravel(), "normal_load_kn": load.ravel(),
-        "tyre_width_m": np.where(np.arange(24) % 2, 0.2, 0.3), "tyre_diameter_m": np.full(24, 0.8),
-    }  # fmt: skip
-    priors = tomllib.loads(Path(default_priors(model.name)).read_text())["parameters"]
-    own = {"dist": "lognormal", "median": 0.03, "sd_log": 0.6, "unit": "1"}
-    noise = {"dist": "half_normal", "sd": 0.1, "unit": "kN"}
-    why = {"reason": "for the test", "source": "assumed"}
-    priors |= {"rr": own | why, "sigma": noise | why}
-    text = "\n".join(written(name, priors[name]) for name in (*model.parameters, "rr", "sigma"))
-    true = np.array([[20.0, 1500.0, 1.0, 1.5, 30.0, 14.0, 0.3, 0.32, 0.03]])
-    y = wheel(true, x)[0] + 0.02 * np.random.default_rng(1).standard_normal(24)
-    return calib.table_from_arrays(x | {"drawbar_pull_kn": y}), text
-
-
-def wheel(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
-    bound = get_model("wong_reece_pull").bind(x)
-    with np.errstate(all="ignore"):
-        return bound.mean_response(theta[:, :8], x) - theta[:, 8:] * x["normal_load_kn"]
-
-
-@pytest.mark.slow
-def test_nine_parameters_come_near_the_gate_with_400_runs_and_are_told_what_it_takes(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    data, priors = wheel_of_nine()
-    simulator = calib.from_callable(
-        wheel, parameters=priors, conditions=list(data.columns)[:4], output="drawbar_pull_kn",
-        name="wheel_of_nine", emulate=True, runs=400,
-    )  # fmt: skip
-    calib.register(simulator)
-    with caplog.at_level(logging.WARNING):
-        emulation = calib.emulated(calib.build_problem("wheel_of_nine", data), seed=1)
-    # By the seed 0.1 to 0.2 noise sds, from more than one with 110 runs; the gate is at 0.1.
-    assert emulation.passed or "needs some" in emulation.reasons[0]
-    assert emulation.held_out is not None
-    assert emulation.held_out.rmse < 0.3
-    (told,) = [r.getMessage() for r in caplog.records if "after 1" in r.getMessage()]
-    assert "runs the emulator is off by" in told
-    assert "fewer if you fix" in told
-    assert "rr (" in told or "k1 (" in told
