@@ -98,8 +98,10 @@ def save_corrected(corrected: Corrected, folder: Path) -> None:
     lines = []
     for key, (name, table) in zip(("calibration", "field", "predict"), tables.items(), strict=True):
         if table is not None:
-            written = table.as_in_file(cells(table.columns, case.covariates))
-            write_table(inner / f"{name}.csv", written)
+            columns = table.as_in_file(cells(table.columns, case.covariates))
+            if name == "fresh" and table.text:  # its predictions repeat it as it was written
+                columns |= dict(zip(table.header, zip(*table.text, strict=True), strict=True))
+            write_table(inner / f"{name}.csv", columns)
             lines.append(f'{key} = "{name}.csv"')
     lines += ["", "[models]", *(f'{output} = "{model}"' for output, model in case.models.items())]
     lines += ["", "[priors]"] if case.priors else []

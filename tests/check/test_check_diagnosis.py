@@ -33,6 +33,10 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
     case = (root / "plain_bekker").rename(root / "mine")
     (case / "field.csv").rename(case / "my campaign.csv")
     text = (case / "case.toml").read_text().replace('"field.csv"', '"my campaign.csv"')
+    # Conditions to predict at have whole numbers, and a column that no model knows.
+    header, *rows = (case / "fresh.csv").read_text().splitlines()
+    rows = [f"{header},note", *(f"{row.replace('.0,', ',', 1)},dry" for row in rows)]
+    (case / "fresh.csv").write_text("\n".join(rows) + "\n")
     (case / "case.toml").write_text(text + CONTEXT)
     words = ["diagnose", str(case), "--out", str(root / "found"), "--workers", "1"]
     ran = CliRunner().invoke(app, words)
