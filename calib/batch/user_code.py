@@ -433,7 +433,7 @@ class _Fingerprint(pickle._Pickler):
 
 @functools.cache
 def _installed(path: Path) -> bool:
-    """Whether a file is of Python, an installed package or this one, and so taken alone."""
+    """Whether a file belongs to Python, an installed package or this one: not the user's."""
     places = map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib"))
     own = Path(__file__).resolve().parents[1]
     return any(path.is_relative_to(f) for f in (*(Path(p).resolve() for p in places), own))

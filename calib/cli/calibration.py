@@ -42,7 +42,7 @@ def report(
     pdf: Annotated[bool, typer.Option("--pdf", help="Figures also as PDF, for print.")] = False,
     max_steps: opt.MaxSteps = 25_600,
     posteriors: Annotated[
-        bool, typer.Option(help="Keep the posteriors, megabytes of netCDF, in the folder.")
+        bool, typer.Option(help="Keep the posteriors (several megabytes of netCDF) in the folder.")
     ] = True,
     views: Annotated[
         bool,

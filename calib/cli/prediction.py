@@ -229,7 +229,7 @@ def predict(
 
 def _check_replaceable(out: Path, at: Path, overwrite: bool) -> None:
     """Refuse to replace a file unless it is a prediction, and that is wanted."""
-    # By its last column a file is known for a prediction: of a run, of one that did not converge,
+    # The last column tells that a file is a prediction: of a run, of one that did not converge,
     # of a diagnosis.
     last = ("outside_calibrated_range", "converged", "_after_upper")
     if not overwrite:
@@ -272,7 +272,7 @@ def _predict_corrected(
     if faults := [cause for cause in corrected.faults if cause not in without]:
         announce(
             f"what is predicted is the reading, with {', '.join(faults)} in it; once the "
-            f"instrument is mended, predict --without {' --without '.join(faults)}"
+            f"instrument is repaired, predict --without {' --without '.join(faults)}"
         )
     beyond = conditions_outside(corrected, table)
     if beyond:
@@ -288,7 +288,7 @@ def _give(columns: dict[str, Any], out: Path | None, *tables: Table) -> None:
     from calib.data.reader import common_label
 
     if label := common_label(*tables):
-        # The last column stays last: by it a prediction is known.
+        # The last column stays last: it tells that the file is a prediction.
         name, last = columns.popitem()
         columns |= {"data_label": [label] * len(last), name: last}
     if out is not None:

@@ -376,7 +376,7 @@ def gap_plate(result: FoundGap) -> Plate:
         ax.set_ylim(min(heights), max(heights))
         ax.ticklabel_format(axis="y", style="plain")
     after.tick_params(labelleft=False)
-    before.set_ylabel(f"Measured minus predicted ({own.axis.unit})")
+    before.set_ylabel(f"Data minus prediction ({own.axis.unit})")
     before.set_title(f"Before: {own.name.replace('_', ' ')}", loc="left")
     after.set_title("After: corrected model", loc="left")
     _which(which, result)

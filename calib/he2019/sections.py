@@ -144,9 +144,9 @@ def _write_gap(
     # Late: where the figures are drawn, which as a rule is another process.
     from calib.he2019.figures import gap_plate
     from calib.report.figures.gap import gap_plates
-    from calib.report.figures.style import pdf_bytes, png
+    from calib.report.figures.style import marked, pdf_bytes, png
 
-    plate = gap_plate(result)
+    (plate,) = marked([gap_plate(result)], result.document.label)
     image = png(plate)
     file = folder / "figures" / f"gap_{plate.name}.png"
     file.write_bytes(image)

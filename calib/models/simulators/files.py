@@ -274,9 +274,9 @@ def _umbridge(file: SimulatorFile, folder: Path) -> UmbridgeRunner:
 def _of_table(file: SimulatorFile, folder: Path) -> TableRunner:
     if not file.emulate:
         raise CalibError(
-            "a table of runs has none where a sampler asks",
+            "a table of runs has no values between its rows, where a sampler needs them",
             where="emulate",
-            expected="emulate = true, which is so by itself",
+            expected="emulate = true, the default",
             hint="leave emulate out",
         )
     content = _content(folder / file.table, "table", "table of runs")

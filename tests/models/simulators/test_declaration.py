@@ -129,7 +129,7 @@ def test_a_table_of_runs_is_known_by_its_content(tmp_path: Path) -> None:
         digests.add(found.digest)
     assert len(digests) == 2
     quick = write_program(tmp_path, run="", table='"runs.csv"', emulate="false")
-    with pytest.raises(CalibError, match=r"wheel.toml, emulate: .* none where a sampler asks"):
+    with pytest.raises(CalibError, match=r"wheel.toml, emulate: .* no values between its rows"):
         read_simulator(quick)
 
 
