@@ -252,7 +252,11 @@ def _predict_corrected(
     run: Path, at: Path, out: Path | None, effects: Path | None, without: Sequence[str]
 ) -> None:
     """Predict with the corrected model of a diagnosis, beside the calibrated simulator."""
+    import numpy as np
+
     from calib.data import read_for_model
+    from calib.data.checks import check_conditions
+    from calib.data.quantities import QUANTITIES
     from calib.gap.corrected import conditions_outside, load_corrected, predict_columns
     from calib.gap.effects import EFFECTS
     from calib.gap.effects.user import load_effects
@@ -263,6 +267,11 @@ def _predict_corrected(
     corrected = load_corrected(run, {**EFFECTS, **own})
     used = {c for o in corrected.data.outputs for c in o.problem.bound.model.conditions}
     table = read_for_model(at, sorted(used))
+    campaigns = corrected.data.case.lab, corrected.data.case.field
+    # Effects depend on conditions that the model may lack.
+    for name in sorted({*corrected.data.view.conditions} & {*table} & {*QUANTITIES}):
+        known = [t[name] for t in campaigns if name in t]
+        check_conditions(table, {name: np.concatenate(known)} if known else {})
     columns = predict_columns(corrected, table, without)
     if "run_order" in corrected.data.view.conditions and "run_order" not in table:
         announce(
@@ -278,7 +287,7 @@ def _predict_corrected(
     if beyond:
         counts = ", ".join(f"{name} in {count} rows" for name, count in beyond.items())
         announce(f"outside what the campaigns covered: {counts}")
-    _give(columns, out, corrected.data.case.lab, corrected.data.case.field)
+    _give(columns, out, *campaigns)
     finish(0, {"columns": _numbers(columns)}, outside=beyond)
 
 

@@ -1,7 +1,8 @@
 """Checks of tables: units in doubt, columns misspelt, rows to fit and to hold out.
 
-A whole column that is as in another unit is refused where a model is to be fitted to it, and only
-warned of elsewhere; the user can say that it is right (`calib.data.table.CHECKED`).
+A whole column that is as in another unit is refused where a model is to be fitted to it or to
+predict at it, and only warned of elsewhere; the user can say that it is right
+(`calib.data.table.CHECKED`).
 """
 
 from __future__ import annotations
@@ -85,7 +86,10 @@ def check_units(table: Table, names: Iterable[str]) -> None:
 
 
 def check_conditions(table: Table, known: Mapping[str, Array]) -> None:
-    """Raise a CalibError for conditions far from all calibrated ones, but not in another unit.
+    """Raise a CalibError for conditions that are, as a whole, as in another unit.
+
+    They are of an unusual size where the calibrated ones are not, or far from all of these and
+    among them in another unit.
 
     Parameters
     ----------
@@ -94,8 +98,13 @@ def check_conditions(table: Table, known: Mapping[str, Array]) -> None:
     known : mapping of str to ndarray
         Those of the calibration, in the canonical unit.
     """
+    odd = {o.name: o.found for o in _odd_columns(table) if o.whole}
     for name, values in known.items():
         low, high = float(values.min()), float(values.max())
+        least, most = QUANTITIES[name].largest or (-np.inf, np.inf)
+        # Where the calibration's own column is unusual, its user said that it is right.
+        if name in odd and least <= max(abs(low), abs(high)) <= most:
+            raise _another_unit(table, name, odd[name])
         far = bool((np.abs(table[name]) > FAR_FROM_KNOWN * max(abs(low), abs(high))).all())
         # What may be zero may be as near to it as one likes.
         if QUANTITIES[name].range.low_open:

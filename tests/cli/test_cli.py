@@ -270,6 +270,9 @@ def test_bad_data_of_a_report_and_a_prediction(
     ran = calib("predict", "run", "--at", "my.csv", "--out", "bands.csv")
     assert_refused(ran, ["my.csv", *words])
     assert not Path("bands.csv").exists()
+    Path("my.csv").write_text(RUT.replace("slip_ratio", "slip_percent"))
+    ran = calib("predict", "run", "--at", "my.csv")
+    assert_refused(ran, ["my.csv", "'slip_percent'", "readings are in fractions"])
 
 
 def prior_text(old: str, new: str) -> str:

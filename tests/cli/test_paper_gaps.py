@@ -117,6 +117,9 @@ def test_a_diagnosis_with_an_effect_of_ones_own_is_predicted_from_with_it(calib:
     far = calib("predict", "found", "--at", "far.csv", "--effects", "mine.py")
     assert far.code == 0, far.err
     assert "outside what the campaigns covered: slip_ratio in 1 rows" in far.err
+    Path("percent.csv").write_text(fresh.read_text().replace("slip_ratio", "slip_percent"))
+    percent = calib("predict", "found", "--at", "percent.csv", "--effects", "mine.py")
+    assert_refused(percent, ["percent.csv", "'slip_percent'", "readings are in fractions"])
     without = calib("predict", "found", "--at", fresh)
     assert (without.code, "soft_patch" in without.err) in {(0, False), (2, True)}
 

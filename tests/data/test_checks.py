@@ -94,10 +94,23 @@ def test_conditions_far_from_the_calibrated_ones_in_another_unit_are_refused(
 
 def test_slips_may_be_as_near_to_zero_as_one_likes() -> None:
     known = {"slip_ratio": np.array([0.05, 0.6])}
-    check_conditions(table_from_arrays({"slip_percent": np.array([0.1, 0.3])}), known)
+    for header, values in {
+        "slip_ratio": [0.001, 0.003],
+        "slip_percent (checked)": [0.1, 0.3],
+    }.items():
+        check_conditions(table_from_arrays({header: np.array(values)}), known)
     small = {"slip_ratio": np.array([0.001, 0.01])}
     with pytest.raises(CalibError, match="readings are in percent"):
         check_conditions(table_from_arrays({"slip_ratio": np.array([0.3])}), small)
+
+
+def test_conditions_of_an_unusual_size_are_refused_as_a_fit_refuses_them() -> None:
+    """They lie within the calibrated range as they are, so that nothing else would be said."""
+    table = table_from_arrays({"slip_percent": SLIP}, source="at.csv")
+    with pytest.raises(CalibError, match="readings are in fractions"):
+        check_conditions(table, {"slip_ratio": SLIP})
+    # The calibration's own slips were as small, and checked.
+    check_conditions(table, {"slip_ratio": 0.01 * SLIP})
 
 
 def test_messages_are_in_the_words_and_units_of_the_file() -> None:
