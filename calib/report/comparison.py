@@ -215,9 +215,9 @@ def document(
     unsound = [name for name, c in candidates.items() if not c.sound]
     stated = stated_of_rows(rows, comparison.weights, unsound)
     for name, c in candidates.items():
-        judged = c.loo if c.held is None else c.held
+        judged, loo = (c.loo, None) if c.held is None else (c.held, c.loo)
         how: Any = {"emulator_fails": fails.get(name, ()), "held_out": hold_out}
-        said = verdict(c.calibration, judged, **how).document()
+        said = verdict(c.calibration, judged, loo=loo, **how).document()
         stated["models"][name] |= {**_model(c), "verdict": said}
     return {
         "schema": "calib/comparison/2",

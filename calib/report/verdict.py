@@ -94,6 +94,9 @@ class Evidence:
     checks: Sequence[Check] = ()  # of the same family as coverage and signs of residuals
     parabolic_in: str = ""  # canonical column of that quadratic
     fitted_at: Sequence[float] = ()  # its two calibrated values
+    # The same errors of fitted rows, each left out in turn, where others were held out.
+    loo_rmse: float = math.nan
+    loo_max_relative_error: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -248,6 +251,7 @@ def verdict(
     calibration: Calibration,
     validation: Validation | None = None,
     *,
+    loo: Validation | None = None,
     emulator_fails: Sequence[str] = (),
     held_out: str = "",
 ) -> Verdict:
@@ -258,6 +262,8 @@ def verdict(
     calibration : Calibration
     validation : Validation, optional
         Of it: `calib.validate_held_out` or `calib.leave_one_out`.
+    loo : Validation, optional
+        `calib.leave_one_out`, where the validation is on rows held out: the worse error is stated.
     emulator_fails : sequence of str
         Why the emulator that stood in for a simulator, if one did, is not good enough.
     held_out : str
@@ -265,7 +271,7 @@ def verdict(
     """
     output = output_of(calibration.problem.bound.model.output)
     prior = prior_predictive(calibration.problem, generator(calibration.seed, output, "prior"))
-    evidence = gather(calibration, validation, prior)
+    evidence = gather(calibration, validation, prior, loo=loo)
     found = judge_evidence(replace(evidence, emulator_fails=emulator_fails))
     held = held_table(Fitted(calibration, validation))
     if held is None:
@@ -287,11 +293,17 @@ def kept_verdict(folder: Path) -> Verdict | None:
     return None if document is None else Verdict.of(document)
 
 
-def gather(calibration: Calibration, v: Validation | None, prior_predictive: Array) -> Evidence:
+def gather(
+    calibration: Calibration,
+    v: Validation | None,
+    prior_predictive: Array,
+    *,
+    loo: Validation | None = None,
+) -> Evidence:
     """Collect the evidence of a calibration, in the units of its file.
 
-    The validation is on rows that were not fitted, if there were any; the measurements that the
-    priors expect at its rows have shape (draws, n).
+    The validation is on rows that were not fitted, if there were any, `loo` by leave-one-out beside
+    it; the measurements that the priors expect at its rows have shape (draws, n).
     """
     result, problem = Fitted(calibration, v), calibration.problem
     model, parabolic = problem.bound.model, problem.bound.model.parabolic_in
@@ -306,6 +318,7 @@ def gather(calibration: Calibration, v: Validation | None, prior_predictive: Arr
             axis = axis_of(parabolic)
             values = joined([axis.value_text(float(p)) for p in fitted_at])
             at_pressures = f"{values} {axis.unit} for {ranges[x_column(result)]}"
+        loo_errors = _errors(problem, loo)
         return Evidence(
             converged=calibration.draws.report.passed,
             reasons=calibration.draws.report.reasons,
@@ -328,6 +341,8 @@ def gather(calibration: Calibration, v: Validation | None, prior_predictive: Arr
             checks=checks_of(calibration),
             parabolic_in=parabolic,
             fitted_at=tuple(fitted_at.tolist()),
+            loo_rmse=loo_errors["rmse"],
+            loo_max_relative_error=loo_errors["max_relative_error"],
         )
 
 
@@ -335,7 +350,7 @@ def _unseen(problem: Problem, v: Validation | None) -> dict[str, Any]:
     """Return what was found on rows that were not fitted."""
     nothing = float("nan")
     if v is None:
-        scores = dict.fromkeys(("effective", "rmse", "max_relative_error", "skill"), nothing)
+        scores = {"effective": nothing, "skill": nothing, **_errors(problem, v)}
         return {"hits": 0, "n": 0, "low_coverage_p": 1.0, **scores}
     covered = v.scores.coverage[0.9]
     complete = bool(np.isfinite(v.draws).all(axis=1).any())
@@ -350,10 +365,17 @@ def _unseen(problem: Problem, v: Validation | None) -> dict[str, Any]:
         "n": covered.n,
         "low_coverage_p": low_coverage_p,
         "effective": effective_rows(v.draws) if complete else nothing,
-        "rmse": axis_of(problem.bound.model.output).factor * v.scores.rmse,
-        "max_relative_error": v.scores.max_relative_error,
+        **_errors(problem, v),
         "skill": 1.0 - v.scores.rmse**2 / scatter if scatter > 0.0 else nothing,
     }
+
+
+def _errors(problem: Problem, v: Validation | None) -> dict[str, float]:
+    """Return the errors of rows that were not fitted, in the unit shown; NaN without any."""
+    if v is None:
+        return {"rmse": math.nan, "max_relative_error": math.nan}
+    factor = axis_of(problem.bound.model.output).factor
+    return {"rmse": factor * v.scores.rmse, "max_relative_error": v.scores.max_relative_error}
 
 
 def _unseen_at(fitted: Array, unseen: Array) -> Where:

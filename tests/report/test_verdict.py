@@ -69,6 +69,9 @@ CASES = {
     "between": RULES["extrapolated"] | {"unseen_at": Where.BETWEEN, "effective": 1.8},
     "nothing unseen": {"n": 0, "rmse": float("nan")},
     "set by the prior": {"prior_set": ("C2",)},
+    "lucky": {"loo_rmse": 0.52, "loo_max_relative_error": 0.9},
+    "lucky and wrong": RULES["misfit"] | {"loo_rmse": 0.52},
+    "unlucky": {"loo_rmse": 0.03, "loo_max_relative_error": 0.05},
     "no relative error": RULES["miscovered"] | {"max_relative_error": float("nan")},
     "unexpected load": RULES["unexpected"] | {"suspects": "the load", "notes": ("5 kN, say",)},
     "extrapolated and wrong": RULES["extrapolated"] | RULES["misfit"],
@@ -82,7 +85,7 @@ def test_what_is_said(case, snapshot):
                        fitted_at=(18.0, 42.0))  # fmt: skip
     found = judge_evidence(evidence)
     assert found.rule == case or case not in RULES
-    assert (found.level is Level.FINE) == (case in ("fine", "set by the prior"))
+    assert (found.level is Level.FINE) == (case in ("fine", "set by the prior", "lucky", "unlucky"))
     document = json.loads(json.dumps(found.document(), allow_nan=False))
     assert Verdict.of(document) == found
     assert document == snapshot

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -142,6 +143,18 @@ def test_a_stack_is_written_and_predicts(frictional: Comparison, tmp_path: Path)
     np.testing.assert_allclose(
         stacked.predictive.lower[0.9], plain.predictive.lower[0.9], rtol=0.04
     )
+
+
+def test_no_error_is_stated_that_is_better_than_that_of_leave_one_out(
+    frictional: Comparison,
+) -> None:
+    """A model without width is luckiest at the middle plate."""
+    stated = document(frictional, "plate_width_mm=100")["models"]["bekker"]
+    assert stated["held_out"]["rmse"] < stated["rmse"]
+    trust = stated["verdict"]["trust"]
+    (said,) = re.findall(r"to ([\d.]+) mm rms", trust)
+    assert float(said) == pytest.approx(stated["rmse"], rel=0.05)
+    assert "each row left out in turn (the held-out rows are easier" in trust
 
 
 @pytest.mark.slow
