@@ -196,13 +196,15 @@ def ensembles_plate(result: OutputResult, reference: Reference = NOTHING) -> Pla
     """Draw traces of the ensemble means and rank histograms, side by side."""
     draws, free = result.calibration.draws, result.calibration.problem.priors.free
     per_row, height, gap_x = (2, 24.0, 17.0) if len(free) <= 6 else (3, 21.0, 15.0)
-    layout = {"left": 18.0, "bottom": 21.0, "top": 5.5, "gap_x": gap_x, "gap_y": 5.5}
+    layout = {"left": 18.0, "right": 0.0, "bottom": 21.0, "top": 5.5, "gap_x": gap_x, "gap_y": 5.5}
     rows, ratios = -(-len(free) // per_row), (2.0, 1.0) * per_row
     fig, axes = style.panels(rows, 2 * per_row, height=height, width_ratios=ratios, **layout)
     pairs = axes.reshape(-1, 2)
     ess = dict(zip(draws.report.names, draws.report.ess_bulk, strict=True))
     handles: dict[str, Any] = {}
     for j, (prior, (trace, ranks)) in enumerate(zip(free, pairs, strict=False)):
+        # Long tick labels of the next trace need more room than the one digit of ranks.
+        ranks.set_position(ranks.get_position().translated(-5.0 / style.DOUBLE_MM, 0.0))
         t = draws.t[..., j]
         natural = np.exp(t) if prior.log else t
         # Of a parameter that spans decades, the mean would show its largest draws alone.

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from calib.report.figures.bands import FILLS
+from calib.report.figures.posterior import ensembles_plate
 from calib.report.figures.style import (
     CYCLE,
     DASHES,
@@ -82,6 +83,23 @@ def test_text_is_read_in_print_and_hides_nothing(drawn):
             for ax in p.figure.axes:
                 if ax.get_visible() and ax.axison:
                     assert not box.overlaps(ax.get_window_extent()), name
+
+
+def test_labels_of_traces_have_room_beside_long_tick_labels(drawbar):
+    with style():
+        figure = ensembles_plate(drawbar).figure
+        seen = [ax for ax in figure.axes if ax.get_visible()]
+        traces = seen[::2]
+        for ax in traces:
+            ax.set_yticks([np.mean(ax.get_ylim())], ["0.0555"])
+        figure.draw_without_rendering()
+    millimetre = figure.dpi / 25.4
+    for ax in traces:
+        label = ax.yaxis.label.get_window_extent()
+        for other in seen:
+            below = [other.xaxis.label, *other.get_xticklabels()] if other is not ax else []
+            for box in [other.get_window_extent(), *(t.get_window_extent() for t in below)]:
+                assert not label.overlaps(box.padded(millimetre)), ax.get_ylabel()
 
 
 def contrast(one: str, other: str) -> float:
