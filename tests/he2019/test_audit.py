@@ -27,7 +27,7 @@ from calib.he2019.sections import audit_section, write_audit_page
 from calib.report.figures.style import Plate
 from tests.browser import faults
 from tests.he2019.altered import flipped, printed_figures
-from tests.report.page.test_page import PNG, Reader
+from tests.pages import PNG, Reader
 
 
 def test_every_printed_figure_is_judged(audit):

@@ -36,7 +36,7 @@ from calib.report.sections import Report
 from calib.report.study import Study
 from calib.report.writer import file_hashes, write_report
 from tests.browser import faults
-from tests.report.page.test_page import PNG, Reader
+from tests.pages import PNG, Reader
 
 GAPS = {gap.name: gap for gap in paper_gaps()}
 CASES = {case.name: case for gap in GAPS.values() for case in (gap.case, *gap.variants.values())}

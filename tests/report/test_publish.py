@@ -42,8 +42,8 @@ from calib.report.page.template import equation as page_equation
 from calib.report.page.template import parametrisation
 from calib.report.publish import publication
 from calib.report.publish.tables import TOPICS
+from tests.pages import Reader
 from tests.report.latex import check, columns, rows
-from tests.report.page.test_page import Reader
 
 # Sentences with marks
 

@@ -15,7 +15,7 @@ from calib.report.sections import Report
 from calib.report.study import Study
 from calib.report.writer import file_hashes, write_report
 from tests.browser import faults
-from tests.report.page.test_page import Reader
+from tests.pages import Reader
 
 
 def write(result, out: Path, **kwargs) -> Path:

@@ -22,8 +22,8 @@ from calib.report.labels import short
 from calib.report.page.diagnosis import hypothesis_groups, render_diagnosis, render_page, write_page
 from tests.browser import faults
 from tests.gap.cases import make_case, write_case
+from tests.pages import Reader
 from tests.report.gap_documents import DOCUMENTS, gap
-from tests.report.page.test_page import Reader
 
 NAMED = DOCUMENTS["named"]
 
