@@ -175,6 +175,11 @@ CASES = {
 }
 
 
+# The smallest mode that docs/reliability.md promises to have its weight, by the most dimensions
+# in which it is. Of 0.9 % in eight, a run may see a fiftieth.
+SMALLEST = {4: 0.01, 8: 0.05}
+
+
 @dataclass(frozen=True)
 class Known:
     problem: Problem
@@ -209,9 +214,12 @@ def several(case: str, d: int) -> Known:
 def assert_in_proportion(known: Known, seed: int) -> None:
     draws = sample_posterior(known.problem, seed)
     assert draws.report.passed
-    ensembles, walkers, steps, _ = draws.t.shape
+    ensembles, walkers, steps, d = draws.t.shape
+    smallest = next(mass for most, mass in SMALLEST.items() if d <= most)
     at = np.searchsorted(known.edges, draws.t[..., 0]).reshape(ensembles * walkers, steps)
     for j, weight in enumerate(known.weights):
+        if weight < smallest:
+            continue
         inside = (at == j).astype(float)
         # The effective size of this very indicator: walkers change between modes less often than
         # they move within one.
