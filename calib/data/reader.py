@@ -115,10 +115,11 @@ def _raise_any(problems: Sequence[Fault], source: str, place: str = "line") -> N
         )
     rows = [f"  {at(p)}: {p.found}; expected: {p.expected}" for p in shown]
     rows += [f"  and {len(problems) - 5} more"] * (len(problems) > 5)
+    hints = list(dict.fromkeys(p.hint for p in shown))
     raise CalibError(
         "\n".join([f"{len(problems)} problems in the data", *rows]),
         where=source,
-        hint="".join(f"\n    - {hint}" for hint in dict.fromkeys(p.hint for p in shown)),
+        hint=hints[0] if len(hints) == 1 else "".join(f"\n    - {hint}" for hint in hints),
     )
 
 

@@ -330,7 +330,10 @@ def _guess(header: str, known: Mapping[str, Quantity], cutoff: float, shortened:
     near = difflib.get_close_matches(name, known, n=1, cutoff=cutoff)
     if shortened and not near:
         # A unit alone ("kn") is the end of a name too, but no word of it.
-        near = [k for k, q in known.items() if k.endswith(f"_{name}") and name not in q.units][:1]
+        near = [
+            k for k, q in known.items()
+            if name not in q.units and (k.endswith(f"_{name}") or q.stem.endswith(f"_{name}"))
+        ][:1]  # fmt: skip
     if not near:
         return ""
     quantity = known[near[0]]

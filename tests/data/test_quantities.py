@@ -150,6 +150,8 @@ def test_missing_columns_are_told_at_once_each_with_its_guess() -> None:
     assert "'Pull (lbf)': did you mean drawbar_pull_lbf?" in message
     # A suggestion does not make up a unit.
     assert "'inflationpressure': did you mean inflation_pressure, with its unit" in message
+    with pytest.raises(CalibError, match="'pull': did you mean drawbar_pull, with its unit"):
+        match_headers(["slip_ratio", "pull"], where="my.csv", required=["drawbar_pull_kn"])
     assert "'kN': did" not in message
     assert "'note': did" not in message
     assert "add the columns slip_ratio (" in message
