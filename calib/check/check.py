@@ -211,8 +211,9 @@ def read_folder(folder: Path) -> Record:
                 if not (folder / "sbc.json").is_file():
                     raise
     written_by = ", ".join(f"`{kind.WRITTEN_BY}`" for kind in kinds)
+    found = f"this is no folder that can be checked ({why})"
     raise CalibError(
-        f"this is no folder that can be checked ({why})",
+        found if folder.exists() else "there is no such folder",
         where=str(folder),
         expected=f"a folder written by one of {written_by}",
         hint="give such a folder; a diagnosis in a report is checked with the report",

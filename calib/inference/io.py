@@ -149,8 +149,9 @@ def read_record[R: Record](kind: type[R], folder: Path) -> R:
     """
     path = folder / kind.FILE
     if not path.is_file():
+        said = f"this is not a {kind.kind} folder (no readable {kind.FILE} in it)"
         raise CalibError(
-            f"this is not a {kind.kind} folder (no readable {kind.FILE} in it)", where=str(folder),
+            said if folder.exists() else "there is no such folder", where=str(folder),
             expected=f"a folder written by `{kind.WRITTEN_BY}`",
             hint=f"give the folder that `{kind.WRITTEN_BY} ... --out` named",
         )  # fmt: skip

@@ -337,7 +337,7 @@ def test_bad_priors(calib: Calib, tmp_path: Path, text: str, words: list[str]) -
         (["report", "my.csv", "--out", "my.csv/deep/rep"], ["my.csv/deep/rep", "is a file"]),
         (["report", "--out", "thesis"], ["thesis", "exists and is not empty"]),
         (["predict", "thesis", "--at", "at.csv"], ["thesis", "not a run folder", "calib fit"]),
-        (["predict", "absent", "--at", "at.csv"], ["absent", "not a run folder"]),
+        (["predict", "absent", "--at", "at.csv"], ["absent", "there is no such folder"]),
         (["template", "pacejka"], ["'pacejka'", *MODELS]),
         (["template", "bekker", "--out", "my.csv/t.csv"], ["my.csv/t.csv", "cannot be written"]),
         (["template", "bekker", "--out", "x" * 300], ["cannot be written"]),

@@ -59,7 +59,7 @@ def test_a_comparison_and_sbc_print_the_files_they_write(calib: Calib) -> None:
 def test_an_error_leaves_the_output_empty(calib: Calib) -> None:
     ran = calib("predict", "absent", "--at", "at.csv", "--json")
     assert (ran.code, ran.out) == (2, "")
-    assert "this is not a run folder" in ran.err
+    assert "there is no such folder" in ran.err
 
 
 def test_what_is_not_finite_is_null(capsys: pytest.CaptureFixture[str]) -> None:

@@ -237,8 +237,10 @@ def test_damage_is_told(saved: Path, tmp_path: Path, damage, place: str | None) 
         assert str(folder / place) in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["absent", "data.csv"])
-def test_something_else_is_no_run_folder(saved: Path, name: str) -> None:
-    with pytest.raises(CalibError, match="not a run folder") as caught:
+@pytest.mark.parametrize(
+    ("name", "said"), [("absent", "no such folder"), ("data.csv", "not a run folder")]
+)
+def test_something_else_is_no_run_folder(saved: Path, name: str, said: str) -> None:
+    with pytest.raises(CalibError, match=said) as caught:
         load_calibration(saved / name)
     assert "calib fit" in str(caught.value)
