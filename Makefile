@@ -112,7 +112,7 @@ OLDEST_TESTS := tests/cli/test_machine.py tests/data tests/models/test_equations
 release-check: INSTALLED := whl tar.gz
 release-check: install-check
 	$(BIN)/python -m venv $(RELEASE)/oldest
-	$(RELEASE)/oldest/bin/pip install -q -c constraints-oldest.txt $(RELEASE)/dist/*.whl pytest hypothesis
+	$(RELEASE)/oldest/bin/pip install -q -c constraints-oldest.txt $(RELEASE)/dist/*.whl pytest hypothesis syrupy
 	$(RELEASE)/oldest/bin/python -m pytest -q -o filterwarnings= -W ignore $(OLDEST_TESTS)
 
 clean:
