@@ -50,6 +50,7 @@ from calib.inference.io import (
     Name,
     Record,
     RunRecord,
+    fault_of,
     read_record,
 )
 from calib.inference.prior_files import default_priors
@@ -211,9 +212,8 @@ def read_folder(folder: Path) -> Record:
                 if not (folder / "sbc.json").is_file():
                     raise
     written_by = ", ".join(f"`{kind.WRITTEN_BY}`" for kind in kinds)
-    found = f"this is no folder that can be checked ({why})"
     raise CalibError(
-        found if folder.exists() else "there is no such folder",
+        fault_of(folder, f"this is no folder that can be checked ({why})"),
         where=str(folder),
         expected=f"a folder written by one of {written_by}",
         hint="give such a folder; a diagnosis in a report is checked with the report",

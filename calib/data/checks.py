@@ -1,7 +1,7 @@
 """Checks of tables: units in doubt, columns misspelt, rows to fit and to hold out.
 
-A whole column that is as in another unit is refused where a model is to be fitted to it or to
-predict at it, and only warned of elsewhere; the user can say that it is right
+A whole column that looks as if it were in another unit is refused where a model is to be fitted to
+it or to predict at it; elsewhere there is a warning. The user can say that the column is right
 (`calib.data.table.CHECKED`).
 """
 
@@ -86,10 +86,10 @@ def check_units(table: Table, names: Iterable[str]) -> None:
 
 
 def check_conditions(table: Table, known: Mapping[str, Array]) -> None:
-    """Raise a CalibError for conditions that are, as a whole, as in another unit.
+    """Raise a CalibError for conditions that look, as a whole, as if they were in another unit.
 
-    They are of an unusual size where the calibrated ones are not, or far from all of these and
-    among them in another unit.
+    Either their size is unusual and that of the calibrated ones is not, or they are far from all
+    calibrated ones and would lie among them in another unit.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def check_conditions(table: Table, known: Mapping[str, Array]) -> None:
     for name, values in known.items():
         low, high = float(values.min()), float(values.max())
         least, most = QUANTITIES[name].largest or (-np.inf, np.inf)
-        # Where the calibration's own column is unusual, its user said that it is right.
+        # If the calibrated ones are as unusual, the user has already said that they are right.
         if name in odd and least <= max(abs(low), abs(high)) <= most:
             raise _another_unit(table, name, odd[name])
         far = bool((np.abs(table[name]) > FAR_FROM_KNOWN * max(abs(low), abs(high))).all())

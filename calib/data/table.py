@@ -330,10 +330,8 @@ def _guess(header: str, known: Mapping[str, Quantity], cutoff: float, shortened:
     near = difflib.get_close_matches(name, known, n=1, cutoff=cutoff)
     if shortened and not near:
         # A unit alone ("kn") is the end of a name too, but no word of it.
-        near = [
-            k for k, q in known.items()
-            if name not in q.units and (k.endswith(f"_{name}") or q.stem.endswith(f"_{name}"))
-        ][:1]  # fmt: skip
+        of_word = ((k, q) for k, q in known.items() if name not in q.units)
+        near = [k for k, q in of_word if any(n.endswith(f"_{name}") for n in (k, q.stem))][:1]
     if not near:
         return ""
     quantity = known[near[0]]

@@ -139,6 +139,11 @@ class RunRecord(Record):
     sha256: dict[File, Hash]
 
 
+def fault_of(folder: Path, fault: str) -> str:
+    """Say what is wrong with a folder that cannot be read; that it is absent comes first."""
+    return fault if folder.exists() else "there is no such folder"
+
+
 def read_record[R: Record](kind: type[R], folder: Path) -> R:
     """Read the record of a kind in a folder.
 
@@ -149,12 +154,12 @@ def read_record[R: Record](kind: type[R], folder: Path) -> R:
     """
     path = folder / kind.FILE
     if not path.is_file():
-        said = f"this is not a {kind.kind} folder (no readable {kind.FILE} in it)"
         raise CalibError(
-            said if folder.exists() else "there is no such folder", where=str(folder),
+            fault_of(folder, f"this is not a {kind.kind} folder (no readable {kind.FILE} in it)"),
+            where=str(folder),
             expected=f"a folder written by `{kind.WRITTEN_BY}`",
             hint=f"give the folder that `{kind.WRITTEN_BY} ... --out` named",
-        )  # fmt: skip
+        )
     try:
         content = json.loads(path.read_bytes())
         return kind.model_validate({**content, "document": content})

@@ -203,7 +203,7 @@ def ensembles_plate(result: OutputResult, reference: Reference = NOTHING) -> Pla
     ess = dict(zip(draws.report.names, draws.report.ess_bulk, strict=True))
     handles: dict[str, Any] = {}
     for j, (prior, (trace, ranks)) in enumerate(zip(free, pairs, strict=False)):
-        # Long tick labels of the next trace need more room than the one digit of ranks.
+        # The tick labels of the next trace need more room than those of the ranks.
         ranks.set_position(ranks.get_position().translated(-5.0 / style.DOUBLE_MM, 0.0))
         t = draws.t[..., j]
         natural = np.exp(t) if prior.log else t

@@ -175,11 +175,6 @@ CASES = {
 }
 
 
-# The smallest mode that docs/reliability.md promises to have its weight, by the most dimensions
-# in which it is. Of 0.9 % in eight, a run may see a fiftieth.
-SMALLEST = {4: 0.01, 8: 0.05}
-
-
 @dataclass(frozen=True)
 class Known:
     problem: Problem
@@ -211,14 +206,13 @@ def several(case: str, d: int) -> Known:
     return Known(problem, edges, weights / weights.sum())
 
 
-def assert_in_proportion(known: Known, seed: int) -> None:
+def assert_in_proportion(known: Known, seed: int, least: float = 0.0) -> None:
     draws = sample_posterior(known.problem, seed)
     assert draws.report.passed
-    ensembles, walkers, steps, d = draws.t.shape
-    smallest = next(mass for most, mass in SMALLEST.items() if d <= most)
+    ensembles, walkers, steps, _ = draws.t.shape
     at = np.searchsorted(known.edges, draws.t[..., 0]).reshape(ensembles * walkers, steps)
     for j, weight in enumerate(known.weights):
-        if weight < smallest:
+        if weight < least:
             continue
         inside = (at == j).astype(float)
         # The effective size of this very indicator: walkers change between modes less often than
@@ -236,10 +230,27 @@ def test_every_mode_has_its_weight(case: str, d: int) -> None:
     assert_in_proportion(several(case, d), seed=1)
 
 
+# A known fault, which docs/reliability.md states: its mode of 0.9 % comes out too small.
+KNOWN_FAULT = pytest.mark.xfail(strict=True, reason="a mode of 0.9 % in eight dimensions")
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize("d", [1, 2, 4, 8])
+@pytest.mark.parametrize(
+    ("case", "d"),
+    [
+        pytest.param(case, d, marks=KNOWN_FAULT if (case, d) == ("four", 8) else ())
+        for d in (1, 2, 4, 8)
+        for case in CASES
+    ],
+)
 def test_every_mode_has_its_weight_for_every_seed(case: str, d: int) -> None:
     known = several(case, d)
     for seed in range(200 if d == 1 else 20):
         assert_in_proportion(known, seed)
+
+
+@pytest.mark.slow
+def test_modes_beside_one_that_is_too_small_have_their_weights() -> None:
+    known = several("four", 8)
+    for seed in range(20):
+        assert_in_proportion(known, seed, least=0.01)
