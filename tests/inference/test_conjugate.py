@@ -121,17 +121,19 @@ def proposal(problem: Problem):
     return adapt(problem.log_prob, guesses, np.random.default_rng(2))[0]
 
 
-@pytest.mark.parametrize("fitted", [True, False])
 def test_the_moves_leave_the_posterior_as_it_is(
-    fitted: bool, problem: Problem, exact: Exact, proposal
+    problem: Problem, exact: Exact, proposal
 ) -> None:
+    """All together, the local ones, and each alone: draws of a proposal would hide a wrong one."""
     walkers, steps, rng = 40, 3000, np.random.default_rng(3)
-    moves = fitted_moves(proposal, rng) if fitted else local_moves()
+    moves = fitted_moves(proposal, rng)
+    assert sum(share for _, share in moves) == pytest.approx(1.0)
     start, _ = proposal.draw(np.random.default_rng(5), walkers)
-    chain, _, _ = run_walkers(problem.log_prob, start, moves, steps, rng)
-    # Walkers exchange positions in these moves; whole ensembles are what is independent, so the
-    # effective size is taken of chains along the steps, which it understates if at all.
-    assert_normal(chain[steps // 3 :].transpose(1, 0, 2), exact.mean, exact.covariance)
+    for used in (moves, local_moves(), *([(move, 1.0)] for move, _ in moves)):
+        chain, _, _ = run_walkers(problem.log_prob, start, used, steps, rng)
+        # Walkers exchange positions in these moves; whole ensembles are what is independent, so the
+        # effective size is taken of chains along the steps, which it understates if at all.
+        assert_normal(chain[steps // 3 :].transpose(1, 0, 2), exact.mean, exact.covariance)
 
 
 def test_importance_sampling_from_the_fitted_proposal(
