@@ -198,8 +198,10 @@ def _is_compared(file: str, first: str = "", *more: str) -> bool:
     """Whether an entry is not about the folder itself: durations, and hashes verified as such."""
     if file == MANIFEST and first == "tasks":
         return more[-1] not in ("sha256", "shipped")
+    if "seconds" in (first, *more[-1:]):
+        return False
     # A run's verdict is on rows that were held out as well, which it does not keep.
-    own = ("seconds", "views", "files", "left_out", "sha256")
+    own = ("views", "files", "left_out", "sha256")
     return file not in (MANIFEST, RUN, COMPARISON) or not (
         first in own or (file == RUN and first == "verdict")
     )
@@ -240,6 +242,8 @@ def document(name: str, job: Job, errors: Errors | None = None) -> list[Item]:
     except FAULTS as error:
         wrong = f"it cannot be read ({type(error).__name__})"
         return [claim(_group_of((name,)), name, wrong)]
+    if not (job.made / name).is_file():
+        return [claim(_group_of((name,)), name, "not computed by this version")]
     return compare_entries(old, read_entries(job.made, name), errors)
 
 

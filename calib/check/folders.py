@@ -203,6 +203,9 @@ def _compare_run(record: RunRecord, calibration: Calibration, job: Job) -> list[
     steps = inside(record.document, "gate").get("steps")
     drawn = drawn_in_run(calibration, compare.count_drawn(job.made), steps)
     items = compare.document(RUN, job, {(RUN, *path): size for path, size in drawn.items()})
+    for name in record.sha256:
+        if name.endswith((".csv", ".json")) and name != DATA:
+            items += compare.document(name, job)
     items.append(compare.draws(POSTERIOR, job))
     mode = (item for item in items if item.name.startswith(f"{RUN}: mode."))
     wrong = "the posterior mode in run.json does not follow from the data and priors here"

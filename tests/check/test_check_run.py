@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
+from calib.check import folders
 from calib.check.check import check
 from calib.check.compare import Status
 from calib.errors import CalibError
@@ -128,6 +129,29 @@ def test_a_missing_file_is_named(run: Path) -> None:
     assert findings(run, quick=True) == {"posterior.nc": "run.json has no hash of it"}
     (run / "data.csv").unlink()
     assert "data.csv" in findings(run)
+
+
+def test_whatever_file_a_run_lists_is_compared(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file of a later version is found by its name in the record alone."""
+    again, name = folders.recompute_run, "widths.csv"
+
+    def write(folder: Path, width: str, seconds: str) -> None:
+        (folder / name).write_text(f"parameter,width,seconds\nn1,{width},{seconds}\n")
+
+    def recompute(record, problem, out, progress):
+        calibration = again(record, problem, out, progress)
+        write(out, "0.25", "4.1")
+        return calibration
+
+    write(run, "0.25", "3.2")
+    edit_json(run / "run.json", lambda m: m["sha256"].update({name: ""}))
+    seal_run(run)
+    assert findings(run) == {name: "not computed by this version"}
+    monkeypatch.setattr(folders, "recompute_run", recompute)
+    assert findings(run) == {}
+    write(run, "0.52", "3.2")
+    seal_run(run)
+    assert set(findings(run)) == {f"{name}: 0.width"}
 
 
 def test_a_run_of_other_draws_is_the_same_within_their_error(run: Path, tmp_path: Path) -> None:

@@ -121,9 +121,7 @@ def proposal(problem: Problem):
     return adapt(problem.log_prob, guesses, np.random.default_rng(2))[0]
 
 
-def test_the_moves_leave_the_posterior_as_it_is(
-    problem: Problem, exact: Exact, proposal
-) -> None:
+def test_the_moves_leave_the_posterior_as_it_is(problem: Problem, exact: Exact, proposal) -> None:
     """All together, the local ones, and each alone: draws of a proposal would hide a wrong one."""
     walkers, steps, rng = 40, 3000, np.random.default_rng(3)
     moves = fitted_moves(proposal, rng)
