@@ -11,6 +11,7 @@ import typer
 
 from calib.cli import options as opt
 from calib.cli.options import emulate, finish, progress_bars, say_failed
+from calib.errors import CalibError
 
 if TYPE_CHECKING:
     from calib.inference.calibration import Calibration
@@ -82,8 +83,15 @@ def report(
         from calib.he2019.embedded import he2019_tasks
         from calib.he2019.sections import AuditSection, GapsSection
 
-        tasks = he2019_tasks()
-        sections = [GapsSection(), AuditSection()]
+        own = {"--hold-out": hold_out, "--model": model, "--priors": priors and not compare}
+        for option in (name for name, given in own.items() if given):
+            raise CalibError(
+                f"{option} is for files of your own, and none is given",
+                expected="calib report FILE.csv …",
+                hint=f"give your CSV files, or leave {option} out",
+            )
+        tasks = he2019_tasks(only or ())
+        sections = [] if only else [GapsSection(), AuditSection()]
         title = "Calibration report: He, Sandu & Osorio (2019), reconstructed data"
     settings = SamplerSettings(max_steps=max_steps)
     prepared = {task.model: (task, task.prior_path) for task in tasks}

@@ -186,7 +186,8 @@ def plan_tasks(
     priors = {prior_file_model(path): path for path in prior_paths}
     for name in only:
         if name not in OUTPUTS:
-            raise CalibError(f"there is no output {name!r}", expected=", ".join(OUTPUTS))
+            wrong, hint = f"there is no output {name!r}", "name one of these"
+            raise CalibError(wrong, expected=", ".join(OUTPUTS), hint=hint)
     tasks: dict[str, Task] = {}
     for table in tables:
         if len(table) > MAX_ROWS:

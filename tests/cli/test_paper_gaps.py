@@ -76,7 +76,7 @@ def test_the_report_of_the_embedded_data_has_the_section(
         asked.append(seed)
         return (found_gaps["plain_bekker"],)
 
-    monkeypatch.setattr("calib.he2019.embedded.he2019_tasks", lambda: ())
+    monkeypatch.setattr("calib.he2019.embedded.he2019_tasks", lambda _: ())
     monkeypatch.setattr("calib.he2019.sections.diagnose_gaps", diagnosed)
     monkeypatch.setattr("calib.he2019.sections.run_audit", lambda *_, **how: audit)
     ran = calib("report", "--out", "rep", "--seed", 5)
@@ -84,6 +84,15 @@ def test_the_report_of_the_embedded_data_has_the_section(
     assert asked == [5]
     assert set(json.loads(Path("rep/summary.json").read_text())["paper_gaps"]) == {"plain_bekker"}
     assert 'id="paper-gaps"' in Path("rep/index.html").read_text()
+
+
+def test_a_report_of_one_embedded_output_has_no_other(calib: Calib) -> None:
+    told = ("--only", "bulk_density", "--no-views", "--max-steps", 200, "--workers", 1)
+    assert calib("report", *told, "--out", "rep").code in (0, 3)
+    found = json.loads(Path("rep/summary.json").read_text())
+    assert set(found["models"]) == {"bulk_density"}
+    assert "paper_gaps" not in found
+    assert not Path("rep/audit.json").exists()
 
 
 def test_in_python_a_diagnosis_is_the_commands() -> None:
