@@ -29,7 +29,8 @@ def report(
     seed: opt.Seed = 2019,
     hold_out: opt.HoldOutOption = None,
     model: Annotated[
-        list[str] | None, typer.Option(help="Model for its output, not the suggested; repeatable.")
+        list[str] | None,
+        typer.Option(help="Model for its output, instead of the suggested one; repeatable."),
     ] = None,
     priors: opt.PriorFiles = None,
     only: Annotated[
@@ -239,7 +240,7 @@ def compare(
     simulator: opt.Simulators = None,
     json: opt.Json = False,
 ) -> None:
-    """Say which of several models the same data prefer, and what they cannot tell."""
+    """Say which of several models the same data prefer, and which they cannot tell apart."""
     from functools import partial
 
     from calib.batch.folders import claimed, drop, fresh_folder, keep

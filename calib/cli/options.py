@@ -63,7 +63,7 @@ CORES = min(2, os.cpu_count() or 1)  # more than two processes bring little
 Workers = Annotated[int, typer.Option(help="Processes on this machine.", min=1, max=1024)]
 Scheduler = Annotated[
     str | None,
-    typer.Option(help="A Dask scheduler in the place of --workers, e.g. tcp://host:8786."),
+    typer.Option(help="A Dask scheduler instead of --workers, e.g. tcp://host:8786."),
 ]
 
 
@@ -113,7 +113,7 @@ def _set_aside(ctx: typer.Context, wanted: bool) -> bool:
 
 Json = Annotated[
     bool,
-    typer.Option("--json", help="Print one JSON object in the place of words.",
+    typer.Option("--json", help="Print one JSON object instead of text.",
                  callback=_set_aside),
 ]  # fmt: skip
 

@@ -110,13 +110,13 @@ class Comparison:
 
     @property
     def sentence(self) -> str:
-        """What the data prefer, and what they cannot tell, in plain words."""
+        """What the data prefer, and which models they cannot tell apart, in plain words."""
         told_apart = {model: d.clear for model, d in self.differences.items()}
         return sentence(told_apart, [c.model for c in self.candidates if not c.sound])
 
 
 def sentence(told_apart: Mapping[str, bool], unsound: Sequence[str]) -> str:
-    """Say what data prefer, and what they cannot tell.
+    """Say which models data prefer, and which they cannot tell apart.
 
     Models come the best first, with whether the data tell each from it; `unsound` did not converge.
     """
