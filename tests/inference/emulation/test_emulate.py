@@ -210,7 +210,8 @@ def test_first_runs_that_fail_in_several_ways_are_no_reason_to_stop() -> None:
             raise RuntimeError("no licence")
         return np.nan * pull(theta, x) if count < 7 else pull(theta, x)
 
-    declared(fickle, "fickle", emulate=True, runs=16)
+    # With 16, one seed in seven has a posterior that lies among the runs that failed.
+    declared(fickle, "fickle", emulate=True, runs=24)
     emulation = calib.emulated(calib.build_problem("fickle", table()), seed=1)
     assert len(emulation.failed) == 6
 
