@@ -255,8 +255,8 @@ def simulator_sd(found: Diagnosis) -> Array:
     modes = find_modes(log_prob, priors, rng)
     guesses = [Guess(m.t, np.linalg.cholesky(m.covariance)) for m in modes]
     proposal, _ = adapt(log_prob, guesses, rng)
-    drawn, log_q = proposal.draw(rng, n := 20_000)
-    log_weight = log_prob(drawn) - log_q
+    drawn = proposal.draw(rng, n := 20_000)
+    log_weight = log_prob(drawn) - proposal.log_prob(drawn)
     weight = np.exp(log_weight - logsumexp(log_weight))
     # What hardly weighs may lie so far out that the model's value overflows.
     inside = weight > 1e-9 / n

@@ -8,8 +8,8 @@ weights estimate the evidence.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -25,37 +25,46 @@ type LogProb = Callable[[Array], Array]
 
 @dataclass(frozen=True)
 class StudentT:
-    """A multivariate Student-t: mean (d,), lower factor of the scale matrix (d, d), and dof."""
+    """A multivariate Student-t: mean (d,), lower factor of the scale matrix (d, d), and dof.
+
+    Or m of them, evaluated at once: means (m, d), factors (m, d, d), dof (m,).
+    """
 
     mean: Array
     cholesky: Array
-    dof: float
+    dof: float | Array
 
     def sample(self, rng: np.random.Generator, size: int) -> Array:
-        """Draw, shape (size, d)."""
+        """Draw from one, shape (size, d)."""
         normal = rng.standard_normal((size, self.mean.size))
         chi2 = rng.chisquare(self.dof, size) / self.dof
         return self.mean + (normal / np.sqrt(chi2)[:, None]) @ self.cholesky.T
 
     def squared_distance(self, t: Array) -> Array:
-        """Squared Mahalanobis distance from the mean, shape (k, d) to (k,)."""
-        z = self._inverse @ (t - self.mean).T
-        return np.asarray(np.einsum("dk,dk->k", z, z))
+        """Squared Mahalanobis distance from each mean, shape (k, d) to (k,) or (m, k)."""
+        z = self._inverse @ (t - self.mean[..., None, :]).swapaxes(-1, -2)
+        return np.asarray(np.einsum("...dk,...dk->...k", z, z))
 
     def log_prob(self, t: Array) -> Array:
-        """Log density, shape (k, d) to (k,)."""
-        power = 0.5 * (self.dof + self.mean.size)
-        return np.asarray(self._log_top - power * np.log1p(self.squared_distance(t) / self.dof))
+        """Log density, shape (k, d) to (k,) or (m, k)."""
+        dof = np.asarray(self.dof)[..., None]
+        power = 0.5 * (dof + t.shape[1])
+        return np.asarray(self._log_top - power * np.log1p(self.squared_distance(t) / dof))
+
+    def __iter__(self) -> Iterator[StudentT]:
+        """Each of m by itself."""
+        return map(StudentT, self.mean, self.cholesky, np.broadcast_to(self.dof, len(self.mean)))
 
     @cached_property
     def _inverse(self) -> Array:
         return np.asarray(np.linalg.inv(self.cholesky))
 
     @cached_property
-    def _log_top(self) -> float:
-        d, dof = self.mean.size, self.dof
+    def _log_top(self) -> Array:
+        d, dof = self.mean.shape[-1], self.dof
         constant = gammaln(0.5 * (dof + d)) - gammaln(0.5 * dof) - 0.5 * d * np.log(dof * np.pi)
-        return float(constant - np.log(np.diag(self.cholesky)).sum())
+        diagonal = np.diagonal(self.cholesky, axis1=-2, axis2=-1)
+        return np.asarray(constant - np.log(diagonal).sum(axis=-1))[..., None]
 
 
 def log_sum(parts: Array) -> Array:
@@ -114,13 +123,13 @@ class TriangularMap:
         """Fit to draws (k, d) of weights (k,), sum 1, worth so many independent ones."""
         mean = weight @ t
         sd = np.sqrt(weight @ np.square(t - mean))
-        z = ((t - mean) / sd)[:, ::-1]
-        features, last = _features(z), _bounded(z[:, 0])
+        z = _from_last((t - mean) / sd)
+        features, last = _features(z), _bounded(z[0])
         coefficients = _regress(features, z, weight, effective)
         # With the last coordinate all scales grow alike, and often much.
-        left = np.log(np.abs(z - features @ coefficients) + 1e-300)
+        left = np.log(np.abs(z - coefficients.T @ features) + 1e-300)
         centred = weight * (last - weight @ last)
-        growth = np.clip(centred @ left / (centred @ last), -1.0, 1.0)
+        growth = np.clip(left @ centred / (centred @ last), -1.0, 1.0)
         growth[0] = 0.0
         # Where the scale is small a draw says more about the bend.
         precise = weight * np.exp(-2.0 * growth[1:].mean() * last) if len(growth) > 1 else weight
@@ -129,25 +138,30 @@ class TriangularMap:
 
     def straighten(self, t: Array) -> tuple[Array, Array]:
         """Return v, shape (k, d), and the log of the Jacobian |dv/dt|, shape (k,)."""
-        z = ((t - self.mean) / self.sd)[:, ::-1]
-        log_scale = np.outer(_bounded(z[:, 0]), self.growth)
-        v = (z - _features(z) @ self.coefficients) * np.exp(-log_scale)
-        return v[:, ::-1], -log_scale.sum(axis=1) - np.log(self.sd).sum()
+        z = _from_last((t - self.mean) / self.sd)
+        log_scale = np.outer(self.growth, _bounded(z[0]))
+        v = (z - self.coefficients.T @ _features(z)) * np.exp(-log_scale)
+        return v[::-1].T, -log_scale.sum(axis=0) - np.log(self.sd).sum()
 
     def bend(self, v: Array) -> Array:
         """Return t, shape (k, d)."""
-        z = v[:, ::-1].copy()
-        z[:, 0] += self.coefficients[0, 0]
-        z[:, 1:] *= np.exp(np.outer(_bounded(z[:, 0]), self.growth[1:]))
-        features, bounded = np.ones((len(v), len(self.coefficients))), np.empty_like(z)
-        for i in range(1, z.shape[1]):
+        z = _from_last(v)
+        z[0] += self.coefficients[0, 0]
+        z[1:] *= np.exp(np.outer(self.growth[1:], _bounded(z[0])))
+        features, bounded = np.ones((len(self.coefficients), len(v))), np.empty_like(z)
+        for i in range(1, len(z)):
             # The features of the coordinate before this one follow those of all earlier ones.
             first, last = 1 + (i - 1) * (i + 2) // 2, 1 + i * (i + 3) // 2
-            bounded[:, i - 1] = _bounded(z[:, i - 1])
-            features[:, first] = z[:, i - 1]
-            features[:, first + 1 : last] = bounded[:, [i - 1]] * bounded[:, :i]
-            z[:, i] += features[:, :last] @ self.coefficients[:last, i]
-        return np.asarray(z[:, ::-1] * self.sd + self.mean)
+            bounded[i - 1] = _bounded(z[i - 1])
+            features[first] = z[i - 1]
+            features[first + 1 : last] = bounded[i - 1] * bounded[:i]
+            z[i] += self.coefficients[:last, i] @ features[:last]
+        return np.asarray(z[::-1].T * self.sd + self.mean)
+
+
+def _from_last(t: Array) -> Array:
+    """Coordinates in the order last to first, each by itself in memory, (k, d) to (d, k)."""
+    return np.ascontiguousarray(t.T[::-1])
 
 
 def _bounded(z: Array) -> Array:
@@ -156,15 +170,15 @@ def _bounded(z: Array) -> Array:
 
 
 def _features(z: Array) -> Array:
-    """One, and for each coordinate itself and its products with those up to it, (k, 1 + ...).
+    """One, and for each coordinate itself and its products with those up to it, (1 + ..., k).
 
-    The features of the first i coordinates come first.
+    The features of the first i coordinates (d, k) come first.
     """
-    d = z.shape[1]
-    features, bounded = np.ones((len(z), 1 + d * (d + 3) // 2)), _bounded(z)
+    d, k = z.shape
+    features, bounded = np.ones((1 + d * (d + 3) // 2, k)), _bounded(z)
     one, other = np.tril_indices(d)
-    features[:, 1 + np.arange(d) * (np.arange(d) + 3) // 2] = z
-    features[:, 2 + one * (one + 3) // 2 + other] = bounded[:, one] * bounded[:, other]
+    features[1 + np.arange(d) * (np.arange(d) + 3) // 2] = z
+    features[2 + one * (one + 3) // 2 + other] = bounded[one] * bounded[other]
     return features
 
 
@@ -174,19 +188,19 @@ def _regress(features: Array, z: Array, weight: Array, effective: float) -> Arra
     Squares and products are shrunk by as much as noise alone would have made of them (the
     positive-part rule of James and Stein): a posterior that is straight stays straight.
     """
-    weighted = features * weight[:, None]
-    gram, moment = weighted.T @ features, weighted.T @ z
+    weighted = features * weight
+    gram, moment = weighted @ features.T, weighted @ z.T
     # As if three draws had said that coordinates are unrelated.
     gram[np.diag_indices_from(gram)] += np.where(np.arange(len(gram)) > 0, 3.0 / effective, 0.0)
-    coefficients = np.zeros((len(gram), z.shape[1]))
+    coefficients = np.zeros((len(gram), len(z)))
     linear = [0]
-    for i in range(z.shape[1]):
+    for i in range(len(z)):
         n = 1 + i * (i + 3) // 2  # features of the coordinates before this one
         plain = np.zeros(n)
         plain[linear] = np.linalg.solve(gram[np.ix_(linear, linear)], moment[linear, i])
         full = np.linalg.solve(gram[:n, :n], moment[:n, i])
         gain = float((full - plain) @ moment[:n, i])
-        left = float(weight @ np.square(z[:, i]) - full @ moment[:n, i])
+        left = float(weight @ np.square(z[i]) - full @ moment[:n, i])
         noise = (n - len(linear)) / effective * left
         share = max(0.0, 1.0 - noise / gain) if gain > 0.0 else 0.0
         coefficients[:n, i] = plain + share * (full - plain)
@@ -196,7 +210,7 @@ def _regress(features: Array, z: Array, weight: Array, effective: float) -> Arra
 
 def fit_mixture(
     x: Array, weight: Array, effective: float, rng: np.random.Generator
-) -> tuple[Array, tuple[StudentT, ...]]:
+) -> tuple[Array, StudentT]:
     """Fit Student-t components to weighted draws (k, d), weights (k,) of sum 1.
 
     By expectation maximisation (Peel & McLachlan 2000, doi:10.1023/A:1008981510081). What the
@@ -209,28 +223,23 @@ def fit_mixture(
     whole = np.cov(x.T, aweights=weight, ddof=0).reshape(d, d)
     centres = x[rng.choice(k, size=m, p=weight)] if m > 1 else weight @ x[None]
     factor = (0.7 if m > 1 else 1.0) * np.linalg.cholesky(whole)
-    shares, parts = np.full(m, 1.0 / m), [StudentT(c, factor, 6.0) for c in centres]
+    shares, parts = np.full(m, 1.0 / m), StudentT(centres, np.tile(factor, (m, 1, 1)), 6.0)
     for _ in range(12):
-        logs = np.log(shares)[:, None] + np.stack([part.log_prob(x) for part in parts])
+        logs = np.log(shares)[:, None] + parts.log_prob(x)
         by_part = np.exp(logs - log_sum(logs)) * weight
         mass = by_part.sum(axis=1)
         kept = mass * effective >= d
         kept[mass.argmax()] = True  # however little the draws are worth
-        updated = []
-        for part, own, total in zip(parts, by_part, mass, strict=True):
-            # Draws far out in a component's tails weigh little.
-            tail = own * (part.dof + d) / (part.dof + part.squared_distance(x))
-            mean = tail @ x / tail.sum()
-            scatter = (tail[:, None] * (x - mean)).T @ (x - mean) + 0.5 * d / effective * whole
-            updated.append((mean, scatter / (total + d / effective)))
+        # Draws far out in a component's tails weigh little.
+        tail = (by_part * (parts.dof + d) / (parts.dof + parts.squared_distance(x)))[kept]
+        means = tail @ x / tail.sum(axis=1)[:, None]
+        away = x - means[:, None]
+        scatter = (tail[..., None] * away).swapaxes(1, 2) @ away + 0.5 * d / effective * whole
+        covariances = scatter / (mass[kept] + d / effective)[:, None, None]
         shares = mass[kept] / mass[kept].sum()
-        parts = [
-            StudentT(mean, np.linalg.cholesky(covariance), 6.0)
-            for (mean, covariance), keep in zip(updated, kept, strict=True)
-            if keep
-        ]
+        parts = StudentT(means, np.linalg.cholesky(covariances), 6.0)
     # A little wider: in importance weights light tails cost more than heavy ones.
-    return shares, tuple(StudentT(p.mean, 1.07 * p.cholesky, p.dof) for p in parts)
+    return shares, replace(parts, cholesky=1.07 * parts.cholesky)
 
 
 @dataclass(frozen=True)
@@ -238,7 +247,7 @@ class Part:
     """What is proposed about one mode: components of weights (m,), in mapped coordinates."""
 
     weights: Array
-    components: tuple[StudentT, ...]
+    components: StudentT
     map: TriangularMap
 
     def draw(self, rng: np.random.Generator, size: int) -> Array:
@@ -250,8 +259,7 @@ class Part:
     def log_prob(self, t: Array) -> Array:
         """Log density, shape (k, d) to (k,)."""
         v, log_jacobian = self.map.straighten(t)
-        logs = np.log(self.weights)[:, None] + np.stack([c.log_prob(v) for c in self.components])
-        return log_sum(logs) + log_jacobian
+        return log_sum(np.log(self.weights)[:, None] + self.components.log_prob(v)) + log_jacobian
 
     def fitted(
         self, draws: Array, weight: Array, effective: float, trust: float, rng: np.random.Generator
@@ -269,9 +277,13 @@ class Part:
         if straight is None:
             return self
         share = 0.08 + 0.32 * (1.0 - trust) ** 2
-        shares, components = fit_mixture(v, weight, effective, rng)
-        broad = StudentT(straight[0], 1.3 * straight[1], 4.0)
-        return Part(np.append((1.0 - share) * shares, share), (*components, broad), found)
+        shares, narrow = fit_mixture(v, weight, effective, rng)
+        components = StudentT(
+            np.concatenate([narrow.mean, straight[0][None]]),
+            np.concatenate([narrow.cholesky, 1.3 * straight[1][None]]),
+            np.append(np.full(shares.size, narrow.dof), 4.0),
+        )
+        return Part(np.append((1.0 - share) * shares, share), components, found)
 
 
 @dataclass(frozen=True)
@@ -286,12 +298,11 @@ class Proposal:
         """Dimension."""
         return int(self.parts[0].map.mean.size)
 
-    def draw(self, rng: np.random.Generator, size: int) -> tuple[Array, Array]:
-        """Draw, and return the log density there, shapes (size, d) and (size,)."""
+    def draw(self, rng: np.random.Generator, size: int) -> Array:
+        """Draw, shape (size, d)."""
         counts = rng.multinomial(size, self.weights)
         drawn = [part.draw(rng, int(n)) for part, n in zip(self.parts, counts, strict=True)]
-        t = np.concatenate(drawn)[rng.permutation(size)]
-        return t, self.log_prob(t)
+        return np.asarray(np.concatenate(drawn)[rng.permutation(size)])
 
     def log_prob(self, t: Array) -> Array:
         """Log density, shape (k, d) to (k,)."""
@@ -305,7 +316,8 @@ class Proposal:
         found = moments(t, np.full(len(t), 1.0 / len(t)))
         if found is None:
             return self
-        part = Part(np.ones(1), (StudentT(*found, 4.0),), TriangularMap.identity(self.n_dim))
+        one = StudentT(found[0][None], found[1][None], np.full(1, 4.0))
+        part = Part(np.ones(1), one, TriangularMap.identity(self.n_dim))
         share = 1.0 / (len(self.parts) + 1)
         return Proposal(np.append((1.0 - share) * self.weights, share), (*self.parts, part))
 
@@ -369,13 +381,13 @@ def adapt(
     known mode, which often promises too narrow a posterior: the first proposal is wider.
     """
     d = guesses[0].mean.size
-    wider = ((0.6, 1.2, 6.0), (0.25, 2.0, 4.0), (0.15, 4.0, 3.0))
+    share, scale, dof = np.array([[0.6, 0.25, 0.15], [1.2, 2.0, 4.0], [6.0, 4.0, 3.0]])
     proposal = Proposal(
         np.full(len(guesses), 1.0 / len(guesses)),
         tuple(
             Part(
-                np.array([share for share, _, _ in wider]),
-                tuple(StudentT(g.mean, scale * g.cholesky, dof) for _, scale, dof in wider),
+                share,
+                StudentT(np.tile(g.mean, (3, 1)), scale[:, None, None] * g.cholesky, dof),
                 TriangularMap.identity(d),
             )
             for g in guesses
@@ -384,8 +396,8 @@ def adapt(
     rounds: list[tuple[Proposal, int]] = []
     all_draws, all_values, log_mixed = np.empty((0, d)), np.empty(0), np.empty(0)
     for size in ROUND_SIZES:
-        draws, log_q = proposal.draw(rng, size * (d + 5) * len(guesses))
-        value = log_prob(draws)
+        draws = proposal.draw(rng, size * (d + 5) * len(guesses))
+        log_q, value = proposal.log_prob(draws), log_prob(draws)
         found = _assess(value - log_q)
         # Above 0.9 a better proposal is not worth a round.
         if found.efficiency > 0.9 or found.efficiency == 0.0:
@@ -409,8 +421,8 @@ def refit(
     """Fit a proposal to draws (k, d), worth so many, of a chain that the old one left short."""
     weight = np.full(len(draws), 1.0 / len(draws))
     proposal = old.fitted(draws, weight, effective, 1.0, rng)
-    drawn, log_q = proposal.draw(rng, ROUND_SIZES[-2] * (draws.shape[1] + 5))
-    return proposal, _assess(log_prob(drawn) - log_q)
+    drawn = proposal.draw(rng, ROUND_SIZES[-2] * (draws.shape[1] + 5))
+    return proposal, _assess(log_prob(drawn) - proposal.log_prob(drawn))
 
 
 def tempered_moments(draws: Array, log_weight: Array) -> tuple[Array, Array] | None:

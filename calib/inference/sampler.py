@@ -350,7 +350,7 @@ def _start(log_prob: LogProb, proposal: Proposal, walkers: int, rng: np.random.G
     """
     coords = np.empty((0, proposal.n_dim))
     for _ in range(500):
-        drawn, _ = proposal.draw(rng, walkers)
+        drawn = proposal.draw(rng, walkers)
         coords = np.concatenate([coords, drawn[np.isfinite(log_prob(drawn))]])
         if len(coords) >= walkers:
             return coords[:walkers]
@@ -417,8 +417,9 @@ def fitted_moves(proposal: Proposal, rng: np.random.Generator) -> Moves:
     import emcee
 
     def draw(coords: Array, _: Any) -> tuple[Array, Array]:
-        new, log_q = proposal.draw(rng, len(coords))
-        return new, proposal.log_prob(coords) - log_q
+        new = proposal.draw(rng, len(coords))
+        before, after = np.split(proposal.log_prob(np.concatenate([coords, new])), 2)
+        return new, before - after
 
     local = [(move, (1.0 - PROPOSED) * share) for move, share in local_moves()]
     return [(emcee.moves.MHMove(draw), PROPOSED), *local]

@@ -76,7 +76,7 @@ def test_two_clusters_are_found_with_their_shares() -> None:
     left = rng.random(4000) < 0.25
     x = rng.standard_normal((4000, 2)) + np.where(left, -8.0, 8.0)[:, None] * [1.0, 0.0]
     shares, components = fit_mixture(x, np.full(4000, 1 / 4000), 4000.0, rng)
-    share = sum(w for w, c in zip(shares, components, strict=True) if c.mean[0] < 0.0)
+    share = shares[components.mean[:, 0] < 0.0].sum()
     assert abs(share - left.mean()) < 0.01
 
 
@@ -85,8 +85,8 @@ def test_draws_come_with_their_density(log_prob) -> None:
     """E[p/q] = 1 under the proposal q for a normal density p in its bulk."""
     proposal, _ = adapted(log_prob, np.array([0.5, -0.5]), 1.5)
     proposal = proposal.extended(np.random.default_rng(1).normal(5.0, 0.1, (50, 2)))
-    t, log_q = proposal.draw(np.random.default_rng(8), 20_000)
-    np.testing.assert_allclose(log_q, proposal.log_prob(t), atol=1e-9)
+    t = proposal.draw(np.random.default_rng(8), 20_000)
+    log_q = proposal.log_prob(t)
     middle = t[np.argmax(log_q)]
     ratio = np.exp(stats.multivariate_normal(middle, 1e-3).logpdf(t) - log_q)
     assert abs(ratio.mean() - 1.0) < 5.0 * ratio.std() / np.sqrt(20_000)
@@ -97,7 +97,7 @@ def test_the_evidence_of_a_gaussian_found_from_a_poor_guess() -> None:
     proposal, found = adapted(lambda t: target.logpdf(t) - 7.5, MEAN + 1.5, 0.5)
     assert found.efficiency > 0.7
     assert abs(found.log_evidence + 7.5) < error_of(found.efficiency)
-    drawn, _ = proposal.draw(np.random.default_rng(1), 20_000)
+    drawn = proposal.draw(np.random.default_rng(1), 20_000)
     # The proposal is wider by design.
     assert np.all(np.abs(drawn.mean(axis=0) - MEAN) < 0.1 * np.sqrt(np.diag(SCALE)))
     spread = drawn.std(axis=0) / np.sqrt(np.diag(SCALE))
