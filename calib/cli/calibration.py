@@ -85,11 +85,11 @@ def report(
         from calib.he2019.sections import AuditSection, GapsSection
 
         own = {"--hold-out": hold_out, "--model": model, "--priors": priors and not compare}
-        for option in (name for name, given in own.items() if given):
+        if ignored := [option for option, value in own.items() if value]:
             raise CalibError(
-                f"{option} is for files of your own, and none is given",
+                f"{ignored[0]} is for files of your own, and none is given",
                 expected="calib report FILE.csv …",
-                hint=f"give your CSV files, or leave {option} out",
+                hint=f"give your CSV files, or leave {ignored[0]} out",
             )
         tasks = he2019_tasks(only or ())
         sections = [] if only else [GapsSection(), AuditSection()]

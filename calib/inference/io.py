@@ -140,7 +140,7 @@ class RunRecord(Record):
 
 
 def fault_of(folder: Path, fault: str) -> str:
-    """Say what is wrong with a folder that cannot be read; that it is absent comes first."""
+    """Say what is wrong with a folder that cannot be read: above all, that it does not exist."""
     return fault if folder.exists() else "there is no such folder"
 
 

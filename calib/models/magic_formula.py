@@ -80,6 +80,7 @@ def _quadratic(low: Array, high: Array, bend: Array, u: Array) -> Array:
     # Where the vertex lies inside, it is the lowest point: mean - curvature - half^2/(4 curvature).
     inside = steep < 2.0 * curvature
     falls_through = inside & (4.0 * curvature * (mean - curvature) <= half * half)
+    # A mean without a value leaves the whole curve without one.
     positive = np.where((mean > steep) & ~falls_through, mean, np.nan)
     return np.asarray(positive + half * u + curvature * (u * u - 1.0))
 
