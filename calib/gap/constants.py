@@ -78,6 +78,7 @@ MOST_LEFT = 0.6  # noise sds; the most of that
 
 # What a diagnosis says.
 NAMED = 0.5  # probability from which a hypothesis or cause is named; test_files
+FALSE_REGIONS = 0.1  # expected part of regions listed that are none, as is usual; test_mixture
 WORTH_SAYING = 0.05  # probability from which a caveat is given; test_files
 FOLDS = 5  # parts of the field rows left out in turn; test_files
 FOLD_DRAWS = 300  # effective draws there: they weigh predictions, not evidence; test_files

@@ -24,7 +24,14 @@ from calib.gap.effects import EFFECTS, Effect
 from calib.gap.fit import Fit
 from calib.gap.hypotheses import parameter_units
 from calib.gap.identifiability import NextMeasurement
-from calib.gap.mixture import UNLISTED, Included, Region, conditions_to_search, row_gaps
+from calib.gap.mixture import (
+    UNLISTED,
+    Included,
+    Region,
+    conditions_to_search,
+    false_discovery_rate,
+    row_gaps,
+)
 from calib.gap.noise import noise_conditions
 from calib.gap.odds import left_of, likelihood_tempering, probabilities
 from calib.inference.priors import Prior
@@ -100,6 +107,7 @@ def gap_document(
         covered=_covered(found),
         covariates=dict(case.covariates),
         regions=found.regions,
+        false_discovery_rate=false_discovery_rate(found.regions),
         leading=tuple(_leading(found)),
         shrink=dict(found.shrink),
         judged_on="new conditions"

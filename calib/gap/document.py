@@ -396,6 +396,8 @@ class GapDocument:
         Conditions of both campaigns together.
     covariates : mapping of str to tuple of str
         Values of declared categories; none for numbers.
+    false_discovery_rate : float or None
+        Part of `regions` that is expected not to exceed the noise; None where it was not kept low.
     leading : tuple of int
         Places in `regions`: the first of each output, and one along what the best is about.
     judged_on, parts
@@ -451,6 +453,7 @@ class GapDocument:
     covered: Mapping[str, Interval] = field(default_factory=dict)
     covariates: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     regions: tuple[Region, ...] = ()
+    false_discovery_rate: float | None = None
     leading: tuple[int, ...] = ()
     parts: int = 0
     next_measurements: tuple[Next, ...] = ()

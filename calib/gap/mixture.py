@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from calib.data import Table
 from calib.data.quantities import OUTPUTS, columns_of
 from calib.gap.campaigns import Campaigns, other_conditions
-from calib.gap.constants import SHARE_ERROR
+from calib.gap.constants import FALSE_REGIONS, SHARE_ERROR
 from calib.gap.effects import View
 from calib.gap.fit import Fit
 from calib.gap.noise import noise_conditions
@@ -271,8 +271,10 @@ def _why(read: bool, moved: bool) -> str:
 def regions(data: Campaigns, truth: Truth, gaps: tuple[RowGap, ...]) -> tuple[Region, ...]:
     """Contiguous stretches of a condition in which rows probably have a gap of one sign.
 
-    The surest first; the others are sought among the rows that lie in none of those before, or
-    every condition would have a stretch that is but the shadow of the first.
+    Of each output they are sought one after the other, each among the rows that lie in none of
+    those before, or every condition would have a stretch that is but the shadow of the first. Of
+    all outputs' they are listed, the surest first, as long as the `false_discovery_rate` stays at
+    or below `FALSE_REGIONS`.
     """
     found: list[Region] = []
     for o, row_gap in zip(data.outputs, gaps, strict=True):
@@ -298,7 +300,19 @@ def regions(data: Campaigns, truth: Truth, gaps: tuple[RowGap, ...]) -> tuple[Re
                 break
             found.append(best[1])
             left &= ~best[2]
+    found.sort(key=lambda region: -region.probability)
+    while found and false_discovery_rate(found) > FALSE_REGIONS:
+        found.pop()
     return tuple(found)
+
+
+def false_discovery_rate(listed: Collection[Region]) -> float:
+    """Expected part of regions whose mean gap does not exceed the noise; 0 of none.
+
+    Its posterior mean, whichever rule chose the regions from the data: Müller, Parmigiani & Rice
+    (2006), after Newton et al. (2004), doi:10.1093/biostatistics/5.2.155.
+    """
+    return sum(1.0 - region.probability for region in listed) / max(len(listed), 1)
 
 
 def _region(
@@ -310,9 +324,10 @@ def _region(
     inside: NDArray[np.bool_],
 ) -> Region:
     mean = draws[:, inside].mean(axis=1)
-    beyond = np.abs(mean) > noise[:, inside].mean(axis=1)
+    within = np.abs(mean) <= noise[:, inside].mean(axis=1)
     ends = _quantile(truth, mean, 0.05), _quantile(truth, mean, 0.95)
-    probability = min(float(truth.weight @ beyond), 1.0)
+    # So that what is within the noise in no draw is exactly certain.
+    probability = 1.0 - float(truth.weight @ within)
     return Region(output, conditions, float(truth.weight @ mean), ends, probability)
 
 

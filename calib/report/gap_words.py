@@ -17,7 +17,7 @@ import numpy as np
 from calib.data.files import plain_number
 from calib.data.quantities import OUTPUTS, QUANTITIES, physical_role, role_of
 from calib.gap.case import words_of
-from calib.gap.constants import ALIKE
+from calib.gap.constants import ALIKE, FALSE_REGIONS
 from calib.gap.describe import gap_document
 from calib.gap.diagnose import Diagnosis
 from calib.gap.document import BENCH, Cause, Explanation, GapDocument, Next, RunTrend, Size
@@ -155,6 +155,7 @@ class _Notation:
     name, chance = staticmethod(short_name), staticmethod(chance)
     rivals, tied, physical = staticmethod(rivals), staticmethod(tied), staticmethod(physical_role)
     bench, early_check, alike_from = BENCH, EARLY, f"{ALIKE:g}"
+    false_regions = percent(FALSE_REGIONS)
 
     def __init__(self, d: GapDocument) -> None:
         self.d = d
