@@ -24,6 +24,7 @@ from calib.gap.effects import EFFECTS, Effect
 from calib.gap.fit import Fit
 from calib.gap.hypotheses import parameter_units
 from calib.gap.identifiability import NextMeasurement
+from calib.gap.laboratory_bias import laboratory_bias
 from calib.gap.mixture import (
     UNLISTED,
     Included,
@@ -109,6 +110,7 @@ def gap_document(
         regions=found.regions,
         false_discovery_rate=false_discovery_rate(found.regions),
         leading=tuple(_leading(found)),
+        laboratory_bias=laboratory_bias(found.corrected.mixture, ranking.best("none")),
         shrink=dict(found.shrink),
         judged_on="new conditions"
         if case.new_conditions is not None

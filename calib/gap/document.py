@@ -19,6 +19,7 @@ from scipy.special import betaincinv
 
 from calib.errors import CalibError, in_words
 from calib.gap.corrected import Shrink
+from calib.gap.laboratory_bias import Bias
 from calib.gap.mixture import Region
 from calib.gap.noise import Noise
 
@@ -400,6 +401,8 @@ class GapDocument:
         Part of `regions` that is expected not to exceed the noise; None where it was not kept low.
     leading : tuple of int
         Places in `regions`: the first of each output, and one along what the best is about.
+    laboratory_bias : tuple of Bias
+        Of every free parameter of the simulators.
     judged_on, parts
         What the error reduction was judged on; in how many parts rows were left out.
     gap, left, coarsening, uncoarsened : float
@@ -455,6 +458,7 @@ class GapDocument:
     regions: tuple[Region, ...] = ()
     false_discovery_rate: float | None = None
     leading: tuple[int, ...] = ()
+    laboratory_bias: tuple[Bias, ...] = ()
     parts: int = 0
     next_measurements: tuple[Next, ...] = ()
     smallest: float = float("nan")

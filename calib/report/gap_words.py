@@ -23,6 +23,7 @@ from calib.gap.diagnose import Diagnosis
 from calib.gap.document import BENCH, Cause, Explanation, GapDocument, Next, RunTrend, Size
 from calib.gap.effects.dependence import PREFIX
 from calib.gap.effects.instruments import EARLY
+from calib.gap.laboratory_bias import Bias
 from calib.gap.mixture import Region
 from calib.report.constants import SHOWN, SURE, TIE
 from calib.report.labels import (
@@ -266,6 +267,14 @@ class _Notation:
         """List explanations, causes, or pairs of a name and a probability."""
         pairs = (i if isinstance(i, tuple) else (_cause_name(i), i.probability) for i in items)
         return joined([f"{(words or {}).get(name, name)} ({odds_text(p)})" for name, p in pairs])
+
+    def biased(self) -> list[Bias]:
+        """Return the parameters that ignoring the causes would move by an sd, the farthest first.
+
+        Nothing where no cause is named.
+        """
+        far = [b for b in self.d.laboratory_bias if abs(b.shift_in_sds) >= 1.0 and self.d.acting]
+        return sorted(far, key=lambda b: -abs(b.shift_in_sds))
 
     def without(self) -> str:
         """List the causes that act without what was put in."""

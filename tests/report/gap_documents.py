@@ -21,6 +21,7 @@ from calib.gap.document import (
     Untested,
     UnusedRow,
 )
+from calib.gap.laboratory_bias import Bias
 from calib.gap.mixture import Region
 from calib.gap.noise import Noise
 
@@ -57,6 +58,9 @@ GAUGE = Cause(
 LUGS = Cause("lug_thrust", 0.95, 0.7, (0.5, 0.9))
 SOFTENING = Cause("moisture_softening", 0.3, 0.1, (0.0, 0.4))
 NOTHING = Cause("unknown", 0.01, 0.0, (0.0, 0.0))
+BIASES = (Bias("drawbar_pull", "K", "kN", 0.31, 0.01, 0.34, 3.0),
+          Bias("drawbar_pull", "D", "1", 1.2, 0.1, 0.71, -4.9),
+          Bias("drawbar_pull", "C", "1", 1.5, 0.1, 1.59, 0.9))  # fmt: skip
 RUNS = RunTrend(("drawbar_pull",), 0.93, (("drift", 0.5), ("step", 0.4), ("neither", 0.03)))
 
 
@@ -83,7 +87,7 @@ def gap(verdict: str, probabilities: dict[str, float], **changes: object) -> Gap
                        ends=(0.4, 0.6)),),
         "conditions": CONDITIONS, "covered": {"slip_ratio": (0.02, 0.6)}, "regions": (ALONG_SLIP,),
         "false_discovery_rate": 0.03, "leading": (0,), "shrink": {"drawbar_pull": SHRINK},
-        "judged_on": "new conditions",
+        "judged_on": "new conditions", "laboratory_bias": BIASES,
         "design": Design({"lug_thrust": 0.5, "sensor_drift": 0.9},
                          {"lug_thrust": 0.7, "sensor_drift": float("inf")},
                          (("lug_thrust", "sensor_drift", 0.96),),
