@@ -35,6 +35,7 @@ from calib.gap.mixture import (
 )
 from calib.gap.noise import noise_conditions
 from calib.gap.odds import left_of, likelihood_tempering, probabilities
+from calib.gap.suggestions import suggestions
 from calib.inference.priors import Prior
 from calib.inference.random import generator
 from calib.models import get_model
@@ -111,6 +112,7 @@ def gap_document(
         false_discovery_rate=false_discovery_rate(found.regions),
         leading=tuple(_leading(found)),
         laboratory_bias=laboratory_bias(found.corrected.mixture, ranking.best("none")),
+        suggestions=suggestions(found.corrected.mixture),
         shrink=dict(found.shrink),
         judged_on="new conditions"
         if case.new_conditions is not None

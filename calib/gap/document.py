@@ -22,6 +22,7 @@ from calib.gap.corrected import Shrink
 from calib.gap.laboratory_bias import Bias
 from calib.gap.mixture import Region
 from calib.gap.noise import Noise
+from calib.gap.suggestions import Suggestion
 
 FILE = "document.json"
 
@@ -403,6 +404,8 @@ class GapDocument:
         Places in `regions`: the first of each output, and one along what the best is about.
     laboratory_bias : tuple of Bias
         Of every free parameter of the simulators.
+    suggestions : tuple of Suggestion
+        Terms that would explain what is unlisted; none where nothing unlisted probably acts.
     judged_on, parts
         What the error reduction was judged on; in how many parts rows were left out.
     gap, left, coarsening, uncoarsened : float
@@ -459,6 +462,7 @@ class GapDocument:
     false_discovery_rate: float | None = None
     leading: tuple[int, ...] = ()
     laboratory_bias: tuple[Bias, ...] = ()
+    suggestions: tuple[Suggestion, ...] = ()
     parts: int = 0
     next_measurements: tuple[Next, ...] = ()
     smallest: float = float("nan")

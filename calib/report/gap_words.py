@@ -36,7 +36,7 @@ from calib.report.labels import (
     percent_range,
     short,
 )
-from calib.report.numbers import format_value
+from calib.report.numbers import format_at, format_value, last_place
 from calib.report.page.template import template
 from calib.report.rows import output_axis
 
@@ -275,6 +275,10 @@ class _Notation:
         """
         far = [b for b in self.d.laboratory_bias if abs(b.shift_in_sds) >= 1.0 and self.d.acting]
         return sorted(far, key=lambda b: -abs(b.shift_in_sds))
+
+    def ignoring(self, b: Bias) -> str:
+        """Write a parameter as it would have come out, as precisely as its sd has it."""
+        return format_at(b.ignoring, last_place(b.sd))
 
     def without(self) -> str:
         """List the causes that act without what was put in."""

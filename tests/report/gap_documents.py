@@ -24,6 +24,7 @@ from calib.gap.document import (
 from calib.gap.laboratory_bias import Bias
 from calib.gap.mixture import Region
 from calib.gap.noise import Noise
+from calib.gap.suggestions import Suggestion
 
 CONDITIONS = {
     "slip_ratio": (0.05, 0.2, 0.4, 0.6),
@@ -61,6 +62,13 @@ NOTHING = Cause("unknown", 0.01, 0.0, (0.0, 0.0))
 BIASES = (Bias("drawbar_pull", "K", "kN", 0.31, 0.01, 0.34, 3.0),
           Bias("drawbar_pull", "D", "1", 1.2, 0.1, 0.71, -4.9),
           Bias("drawbar_pull", "C", "1", 1.5, 0.1, 1.59, 0.9))  # fmt: skip
+SUGGESTIONS = (
+    Suggestion("drawbar_pull", "step", ("slip_ratio",), 0.25, True, False, 0.6, 0.42),
+    Suggestion("drawbar_pull", "linear", ("run_order",), 0.0, False, True, 0.2, 0.3),
+    Suggestion("drawbar_pull", "quadratic", ("slip_ratio",), 0.0, False, False, 0.1, 0.2),
+    Suggestion("drawbar_pull", "product", ("slip_ratio", "inflation_pressure_psi"), 0.0, False,
+               True, 0.07, 0.1),
+)  # fmt: skip
 RUNS = RunTrend(("drawbar_pull",), 0.93, (("drift", 0.5), ("step", 0.4), ("neither", 0.03)))
 
 
@@ -123,7 +131,7 @@ DOCUMENTS: dict[str, GapDocument] = {
     "unknown": gap("unknown", {"unknown": 0.95}, causes=(), regions=(), leading=(),
                    unlisted=Unlisted("sinkage", ("drawbar_pull",), "rut_depth_mm", (22.0, 3.0),
                                      True, surest=ALONG_SLIP),
-                   sizes=(Size("rms", "drawbar_pull", 0.1, 0.01),)),
+                   sizes=(Size("rms", "drawbar_pull", 0.1, 0.01),), suggestions=SUGGESTIONS),
     "unknown: in waves": gap("unknown", {"unknown": 0.95}, causes=(), sizes=(),
                              unlisted=Unlisted("ripple", ("drawbar_pull",))),
     "tie": gap("ambiguous", {"lug_thrust": 0.45, "sensor_drift": 0.4, "none": 0.1}, sizes=(),

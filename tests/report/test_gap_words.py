@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from dataclasses import replace
 
 import pytest
@@ -10,6 +12,8 @@ from calib.gap.document import GapDocument, RunTrend, load_document
 from calib.gap.files import contract
 from calib.report.gap_words import RULES, Tone, Words, chance, gap_verdict, judge, short_name
 from calib.report.labels import odds_text
+from calib.report.page.diagnosis import render_page
+from tests.pages import Reader
 from tests.report.gap_documents import DOCUMENTS, PULL, RUNS, gap
 
 MACROS = ("covered", "prior")
@@ -25,6 +29,7 @@ def test_what_is_said(name, snapshot):
     said += [words(macro) for macro in MACROS] + [words("simulator", o) for o in d.outputs]
     said += [words(kind, p) for e in d.explanations for kind, own in
              (("parameter", e.parameters), ("shift", e.shifts)) for p in own]  # fmt: skip
+    said += [words("term", s) for s in d.suggestions]
     assert "\n".join([*said, words.terminal()]) == snapshot
 
 
@@ -60,6 +65,17 @@ def test_a_saved_document_is_loaded_as_it_was(name, tmp_path):
     loaded = load_document(tmp_path)
     assert loaded.json() == DOCUMENTS[name].json()
     assert gap_verdict(loaded) == gap_verdict(DOCUMENTS[name])
+
+
+def test_a_document_of_before_is_loaded_and_has_its_page(tmp_path):
+    old = json.loads(DOCUMENTS["named"].json())
+    for name in ("false_discovery_rate", "laboratory_bias", "suggestions"):
+        del old[name]
+    (tmp_path / "document.json").write_text(json.dumps(old))
+    loaded = load_document(tmp_path)
+    assert gap_verdict(loaded) == gap_verdict(DOCUMENTS["named"])
+    text = Reader(render_page(loaded, [], {})).text
+    assert not re.search("false discovery|[Ii]gnoring the causes|Suggestions", text)
 
 
 def test_programs_read_the_same_numbers():
