@@ -53,18 +53,16 @@ def laboratory_bias(mixed: Mixture, none: Fit) -> tuple[Bias, ...]:
     for i, (fit, probability) in enumerate(zip(mixed.fits, mixed.probability, strict=True)):
         size = max(100, int(1200 * probability))
         rng = generator(mixed.seed, "gap", "laboratory", fit.forward.hypothesis.name, i)
-        # All hypotheses have the simulators' parameters first.
-        draws.append(fit.draws(rng, size)[:, : fit.forward.n_shared])
+        psi = fit.draws(rng, size)
+        draws.append({name: psi[:, part] for name, part in fit.forward.theta_slices.items()})
         weights.append(np.full(size, probability / size))
-    psi = np.concatenate(draws)
     weighted = Truth({}, {}, {}, {}, np.concatenate(weights))
     found = []
     for o in mixed.data.outputs:
-        part = none.forward.theta_slices[o.name]
-        natural = o.priors.to_natural(psi[:, part])
+        natural = o.priors.to_natural(np.concatenate([theta[o.name] for theta in draws]))
         low, median, high = (weighted.quantile(natural, q) for q in (0.16, 0.5, 0.84))
         sd = 0.5 * (high - low)
-        ignoring = o.priors.to_natural(none.psi[None, part])[0]
+        ignoring = o.priors.to_natural(none.psi[None, none.forward.theta_slices[o.name]])[0]
         # At a bound there may be no spread, and nothing to compare with.
         shift = np.divide(ignoring - median, sd, out=np.zeros_like(sd), where=sd > 0.0)
         columns = np.stack([median, sd, ignoring, shift], axis=1).tolist()
