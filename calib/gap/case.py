@@ -12,6 +12,7 @@ A folder with a ``case.toml``::
     tyre_temperature_c = "number"
     operator = "category"              # or its values, ["A. Lind", "B. Berg"]
     [context]                          # optional: what is known before the diagnosis
+    same_soil = true
     suspected = {lug_thrust = 0.5}
     excluded = ["sensor_drift"]
     sizes = {force_offset = {offset = {mean = 0.1, sd = 0.02}}}
@@ -30,7 +31,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from calib.data import Table, read_table
 from calib.data.files import TOML_HINT, read_text, read_toml
@@ -38,6 +39,7 @@ from calib.data.quantities import OUTPUTS, output_of
 from calib.data.reader import common_label
 from calib.data.table import MAX_TEXT_ROWS, parse_header
 from calib.errors import CalibError, in_words, meant
+from calib.gap.constants import SHIFT_PRIOR
 from calib.inference.prior_files import DeclaredPriors
 from calib.models.base import Array
 
@@ -60,6 +62,9 @@ class Context(_Strict):
 
     Parameters
     ----------
+    same_soil : bool, optional
+        Whether field and laboratory have the same soil. It sets the sizes of parameter shifts and,
+        unless `suspected` does, their probability.
     suspected : mapping of str to float
         Prior probability that a cause acts, whatever else acts.
     excluded : list of str
@@ -68,9 +73,19 @@ class Context(_Strict):
         Effect to parameter to its known size.
     """
 
+    same_soil: Annotated[bool | None, Field(strict=True)] = None
     suspected: dict[str, Annotated[float, Field(gt=0.0, lt=1.0)]] = {}
     excluded: list[str] = []
     sizes: dict[str, dict[str, Size]] = {}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _shift_of_soil(cls, content: Any) -> Any:
+        same = content.get("same_soil") if isinstance(content, Mapping) else None
+        if not isinstance(same, bool) or not isinstance(content.get("suspected", {}), Mapping):
+            return content
+        usual = {"parameter_shift": SHIFT_PRIOR[same]}
+        return {**content, "suspected": usual | {**content.get("suspected", {})}}
 
     def __bool__(self) -> bool:
         return bool(self.suspected or self.excluded or self.sizes)
@@ -82,7 +97,8 @@ class Context(_Strict):
 
     def words(self, units: Mapping[tuple[str, str], str] | None = None) -> list[str]:
         """Say what was put in; sizes with the units of (effect, parameter), if they are given."""
-        said = [f"{n.replace('_', ' ')} suspected ({p:g})" for n, p in self.suspected.items()]
+        said = {None: [], True: ["the same soil"], False: ["another soil"]}[self.same_soil]
+        said += [f"{n.replace('_', ' ')} suspected ({p:g})" for n, p in self.suspected.items()]
         said += [f"{name.replace('_', ' ')} excluded" for name in self.excluded]
         said += [
             f"{name.replace('_', ' ')}: {parameter} {size.mean:g} ± {size.sd:g}"
@@ -236,8 +252,8 @@ def read_context(content: Any, where: str) -> Context:
         raise CalibError(
             in_words(first),
             where=f"{where}, context.{place}",
-            expected="suspected = {name = probability}, excluded = [names], "
-            "sizes = {name = {parameter = {mean = …, sd = …}}}",
+            expected="same_soil = true or false, suspected = {name = probability}, "
+            "excluded = [names], sizes = {name = {parameter = {mean = …, sd = …}}}",
             hint="write, for example: suspected = {lug_thrust = 0.5} and, in the next line, "
             'excluded = ["sensor_drift"]',
         ) from None

@@ -128,7 +128,8 @@ def save_corrected(corrected: Corrected, folder: Path) -> None:
 
 
 def _context_lines(context: Context) -> list[str]:
-    lines = ["", "[context]", f"excluded = {json.dumps(list(context.excluded))}"]
+    soil = [] if context.same_soil is None else [f"same_soil = {json.dumps(context.same_soil)}"]
+    lines = ["", "[context]", *soil, f"excluded = {json.dumps(list(context.excluded))}"]
     lines += ["[context.suspected]", *(f"{name} = {p!r}" for name, p in context.suspected.items())]
     for name, sizes in context.sizes.items():
         lines.append(f"[context.sizes.{name}]")

@@ -36,6 +36,7 @@ from calib.gap.mixture import (
 from calib.gap.noise import noise_conditions
 from calib.gap.odds import left_of, likelihood_tempering, probabilities
 from calib.gap.suggestions import suggestions
+from calib.gap.same_soil import shift_if_same_soil
 from calib.inference.priors import Prior
 from calib.inference.random import generator
 from calib.models import get_model
@@ -140,6 +141,7 @@ def gap_document(
         excluded=tuple(case.context.excluded),
         suspected=(*case.context.suspected, *case.context.sizes),
         without_context=found.without_context,
+        shift_if_same_soil=shift_if_same_soil(ranking),
         doubts=tuple(remark.title for remark in found.doubts),
         notes=case.notes,
         warnings=tuple(warnings),

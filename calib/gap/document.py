@@ -419,6 +419,9 @@ class GapDocument:
     put_in, suspected, excluded, without_context
         What was put in beyond the data, in words; causes suspected or sized; causes excluded; and
         the probabilities of causes without all that.
+    shift_if_same_soil : float, optional
+        Probability of ``parameter_shift`` if the soil were known to be the same; None if it is
+        known, or no shift is in play.
     doubts : tuple of str
         What the most probable explanation should not leave in the field, each a clause.
     prediction : mapping of str to tuple
@@ -473,6 +476,7 @@ class GapDocument:
     suspected: tuple[str, ...] = ()
     excluded: tuple[str, ...] = ()
     without_context: Mapping[str, float] | None = None
+    shift_if_same_soil: float | None = None
     doubts: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()

@@ -15,6 +15,8 @@ from calib.gap.case import Context, Size
 from calib.gap.constants import (
     COVERED,
     ONSET,
+    OTHER_SOIL_SHIFTS,
+    SAME_SOIL_SHIFTS,
     SELDOM,
     SHIFTS,
     SMOOTHS,
@@ -349,13 +351,20 @@ def _wide(priors: Priors) -> Priors:
 
 
 def shifts(data: Campaigns) -> list[Hypothesis]:
-    """Other parameter values in the field, by a little or a lot, each by itself or as soils do."""
+    """Other parameter values in the field, by a little or a lot, each by itself or as soils do.
+
+    By less in the same soil: a looser place of it moves them as a softer soil does, a little.
+    """
+    same = data.case.context.same_soil
+    sizes = {None: SHIFTS, True: SAME_SOIL_SHIFTS, False: OTHER_SOIL_SHIFTS}[same]
     kinds: dict[ShiftAs, float] = {"alone": 1.0 - SOIL, "soil": SOIL}
+    if same is False:
+        kinds = {"soil": 1.0}
     if set(data.roles) == {"density"}:
         kinds = {"alone": 1.0}
     return [
-        Hypothesis("parameter_shift", shift=size, shift_as=kind, share=share / len(SHIFTS))
-        for size in SHIFTS
+        Hypothesis("parameter_shift", shift=size, shift_as=kind, share=share / len(sizes))
+        for size in sizes
         for kind, share in kinds.items()
     ]
 

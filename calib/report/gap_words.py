@@ -360,6 +360,8 @@ class Words:
             yield "Which", self("which")
             if d.put_in:
                 yield "Known beforehand", self("known")
+            if d.shift_if_same_soil is not None:
+                yield "Same soil", self("same_soil")
             if others:
                 yield "Not excluded", self.n.listed(others)
                 yield from self._next()
@@ -368,6 +370,7 @@ class Words:
         for label, macro, there in (
             ("Causes", "causes", d.causes),
             ("Known beforehand", "known", d.put_in),
+            ("Same soil", "same_soil", d.shift_if_same_soil is not None),
             ("Which", "which", True),
             ("Not tested", "untested", d.untested),
             ("Assumed", "assumed", d.assumed),

@@ -7,6 +7,8 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -33,6 +35,7 @@ from calib.gap.effects import EFFECTS
 from calib.gap.files import document
 from calib.gap.hypotheses import Hypothesis, unusual_sizes, with_known_size
 from calib.gap.odds import Odds
+from calib.gap.same_soil import shift_if_same_soil
 from calib.inference.calibration import calibrate
 from calib.inference.io import save_calibration
 from calib.inference.prior_files import DeclaredPriors, default_priors
@@ -194,6 +197,48 @@ def test_suspicion_multiplies_the_odds_of_every_explanation_with_the_cause():
         assert given.ln_prior(name) == plain.ln_prior(name)
 
 
+@pytest.mark.parametrize(("same", "p"), [(True, 0.06), (False, 0.5)])
+def test_the_soil_sets_how_probable_a_shift_is_unless_that_is_said(same, p):
+    """As if it were suspected so; the usual probability of a shift is 0.12."""
+    plain, given = Odds.of(10, Context()), Odds.of(10, Context(same_soil=same))
+    ratio = (p / (1.0 - p)) / (0.12 / 0.88)
+    for name in ("parameter_shift", "parameter_shift+unknown"):
+        assert given.ln_prior(name) - plain.ln_prior(name) == pytest.approx(np.log(ratio))
+    for name in ("none", "unknown", "rate_effect", "lug_thrust+rate_effect"):
+        assert given.ln_prior(name) == plain.ln_prior(name)
+    said = Context(same_soil=same, suspected={"parameter_shift": 0.3})
+    assert said.suspected == {"parameter_shift": 0.3}
+    assert Context(same_soil=same).words()[1] == f"parameter shift suspected ({p:g})"
+
+
+def test_shifts_are_weighed_anew_for_the_same_soil(fake_ranking):
+    """Those of 0.1 sds count 3/2, for they are one of two sizes; those of 0.6 sds do not."""
+    odds = (0.06 / 0.94) / (0.12 / 0.88)
+    shift = 0.12 * 0.85 * odds * 1.5 * np.exp(-1.0)
+    assert shift_if_same_soil(fake_ranking()) == pytest.approx(shift / (shift + 0.40))
+    assert shift_if_same_soil(fake_ranking(same_soil=True)) is None
+    assert shift_if_same_soil(fake_ranking(p=0.04)) is None
+
+
+@pytest.fixture
+def fake_ranking():
+    def made(same_soil: bool | None = None, p: float = 0.3) -> Any:
+        context = Context(same_soil=same_soil)
+        data = SimpleNamespace(case=SimpleNamespace(context=context))
+        fits = [SimpleNamespace(forward=SimpleNamespace(
+            hypothesis=Hypothesis("", shift=s), data=data)) for s in (0.0, 0.1, 0.6)]  # fmt: skip
+        return SimpleNamespace(
+            fits={"none": fits[:1], "parameter_shift": fits[1:]},
+            scores={"none": (0.0,), "parameter_shift": (-1.0, 2.0)},
+            log_evidence={"none": 0.0, "parameter_shift": 2.05},
+            probability={"none": 1.0 - p, "parameter_shift": p},
+            odds=Odds(5, {}),
+            gap=0.0,
+        )
+
+    return made
+
+
 def test_an_excluded_cause_is_not_tested_and_both_verdicts_are_told():
     case = make_case("sensor_drift", models=PULL_ONLY)
     found = diagnose_once(
@@ -239,6 +284,7 @@ def test_a_known_size_takes_the_place_of_the_prior():
         ("sizes = {force_offset = {offset = {mean = nan, sd = 1.0}}}", "finite number"),
         ("sizes = {force_offset = {offset = {mean = 1.0, sd = nan}}}", "finite number"),
         ("suspected = {lug_thrust = nan}", "finite number"),
+        ('same_soil = "yes"', "context.same_soil"),
     ],
 )
 def test_what_is_wrong_with_a_context_is_named(tmp_path, table, words):
@@ -274,11 +320,18 @@ def test_a_context_is_read_from_the_case(tmp_path):
     folder = write_case(make_case("force_offset"), tmp_path / "case")
     toml = (folder / "case.toml").read_text()
     (folder / "case.toml").write_text(
-        toml + '\n[context]\nsuspected = {lug_thrust = 0.5}\nexcluded = ["sensor_drift"]\n'
+        f"{toml}\n[context]\nsame_soil = true\n"
+        'suspected = {lug_thrust = 0.5, parameter_shift = 0.2}\nexcluded = ["sensor_drift"]\n'
     )
     context = read_case(folder).context
-    assert context == Context(suspected={"lug_thrust": 0.5}, excluded=("sensor_drift",))
-    assert context.words() == ["lug thrust suspected (0.5)", "sensor drift excluded"]
+    suspected = {"lug_thrust": 0.5, "parameter_shift": 0.2}
+    assert context == Context(same_soil=True, suspected=suspected, excluded=("sensor_drift",))
+    assert context.words() == [
+        "the same soil",
+        "parameter shift suspected (0.2)",
+        "lug thrust suspected (0.5)",
+        "sensor drift excluded",
+    ]
     assert read_context(None, "") == Context()
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from calib.data import table_from_arrays
 from calib.gap.campaigns import campaigns
-from calib.gap.case import Case
+from calib.gap.case import Case, Context
 from calib.gap.constants import SHIFTS
 from calib.gap.describe import unlisted
 from calib.gap.diagnose import diagnose, diagnose_once
@@ -73,6 +73,16 @@ def test_parameters_shift_by_themselves_or_as_with_another_soil_in_every_size(da
     assert set(found) == {(size, kind) for size in SHIFTS for kind in ("alone", "soil")}
     assert sum(found.values()) == pytest.approx(1.0)
     assert found[SHIFTS[0], "soil"] == pytest.approx(2.0 * found[SHIFTS[0], "alone"])
+
+
+def test_the_same_soil_shifts_less_and_another_one_more_and_together(data):
+    for same, sizes, kinds in ((True, {0.1, 0.25}, 2), (False, {0.25, 0.6, 1.4}, 1)):
+        case = replace(data.case, context=Context(same_soil=same))
+        found = shifts(replace(data, case=case))
+        assert {h.shift for h in found} == sizes
+        assert len(found) == kinds * len(sizes)
+        assert sum(h.share for h in found) == pytest.approx(1.0)
+        assert same or {h.shift_as for h in found} == {"soil"}
 
 
 def density_campaigns(water: str = "gravimetric_water_content", step: float = 0.0):

@@ -139,6 +139,7 @@ DOCUMENTS: dict[str, GapDocument] = {
     "tie: of many": gap("ambiguous", {"lug_thrust": 0.3, **{f"e{i}": 0.05 for i in range(9)}},
                        next_measurements=(Next(("lug_thrust", "e1"), {}, 1e-4),)),
     "recalibrate": gap("effect", {"parameter_shift": 0.95}, next_measurements=(),
+                       shift_if_same_soil=0.62,
                        causes=(Cause("parameter_shift", 0.95, 1.0, (1.0, 1.0)),),
                        sizes=(Size("rms", "drawbar_pull", 0.1, 0.01),)),
     "named": gap("effect", {"lug_thrust": 0.93, "sensor_drift": 0.07}, label="reconstructed",
