@@ -28,7 +28,8 @@ from calib.gap.constants import (
     WIDER_LOG,
 )
 from calib.gap.effects import EFFECTS, Effect
-from calib.gap.effects.dependence import DependsOn, DiffersBy, ReadingDrift, ReadingStep
+from calib.gap.effects.dependence import DependsOn, DiffersBy
+from calib.gap.effects.readings import ConditionBias, Kind, Reading
 from calib.inference.prior_files import (
     PriorFile,
     declared_priors,
@@ -176,19 +177,32 @@ def dependences(data: Campaigns) -> dict[str, Effect]:
 
 
 def readings(data: Campaigns) -> dict[str, Effect]:
-    """Return what the reading of each output but the drawbar pull may do over the runs, by name."""
-    found: dict[str, Effect] = {}
-    if not _varies(data, "order"):
-        return found
+    """Return what may be wrong with readings and no listed effect is about, by name.
+
+    Of each output gain, offset, and if the order of the runs is known drift and step; gain and
+    offset of each condition of a simulator that varies, or differs from the laboratory's.
+    """
+    kinds: tuple[Kind, ...] = ("drift", "step") if _varies(data, "order") else ()
+    found: list[Effect] = []
+    taken: dict[str, tuple[str, ...]] = {}
     for o in data.outputs:
-        if o.role == "pull":
-            continue
-        log = o.problem.bound.model.response == "log"
-        typical = 1.0 if log else float(np.median(np.abs(o.problem.response)))
-        unit = "1" if log else QUANTITIES[OUTPUTS[o.name]].unit
-        for effect in (kind(o.role, o.name, unit, typical) for kind in (ReadingDrift, ReadingStep)):
-            found[effect.name] = effect
-    return found
+        model, column = o.problem.bound.model, OUTPUTS[o.name]
+        values = np.abs(o.problem.bound.from_response(o.problem.response))
+        typical = float(np.median(values)) or 1.0
+        log, unit = model.response == "log", QUANTITIES[column].unit
+        own: tuple[Kind, ...] = ("gain",) if o.role == "pull" else (*kinds, "gain", "offset")
+        found += [Reading(kind, o.role, o.name, unit, typical, log=log) for kind in own]
+        for condition in model.conditions:
+            taken[condition] = (*taken.get(condition, ()), o.role)
+    gauges = {"slip", "cone", *_SAME["pressure"], *_SAME["water"]}
+    if data.view.column("pressure") is None:
+        gauges.remove("ground_pressure")
+    for column, outputs in taken.items():
+        q, typical = QUANTITIES[column], abs(data.view.lab_of(role_of(column))) or 1.0
+        if q.physical not in gauges:
+            bias = ConditionBias(q.physical, q.stem, outputs, q.unit, typical)
+            found += [bias] if bias.not_testable(data.view, data.roles) is None else []
+    return {effect.name: effect for effect in found}
 
 
 def with_case_effects(data: Campaigns, effects: Mapping[str, Effect]) -> dict[str, Effect]:
@@ -201,7 +215,7 @@ def prior_share(effect: Effect, listed: Collection[str]) -> float | None:
     """How probable an effect is beside a listed one that is tried in sets; None if it is such."""
     if covered(effect, listed):
         return COVERED
-    return SELDOM if isinstance(effect, ReadingDrift | ReadingStep) else None
+    return SELDOM if effect.seldom else None
 
 
 def _declared(data: Campaigns) -> dict[str, Effect]:

@@ -13,7 +13,6 @@ from calib.gap.campaigns import Campaigns, OutputData
 from calib.gap.case import Context
 from calib.gap.constants import FOLLOWS_RUNS, PLENTY, SEARCH
 from calib.gap.effects import EFFECTS, Effect
-from calib.gap.effects.dependence import ReadingDrift, ReadingStep
 from calib.gap.fit import Fit
 from calib.gap.hypotheses import (
     Hypothesis,
@@ -174,7 +173,7 @@ def rank(
     beside -= set(context.excluded)
     odds = Odds.of(len(single) - len(beside), context)
     guesses = StartingPoints(data, lab_mode, noise, odds)
-    asked = [h for h in single if not isinstance(h.effects[0], ReadingDrift | ReadingStep)]
+    asked = [h for h in single if not (h.effects[0].seldom and "order" in h.effects[0].covariates)]
     fits = guesses.fit([Hypothesis("none"), *shifts(data), *asked])
     following = follows_runs(data, fits["none"][0])
     readings = [h for h in single if h not in asked]

@@ -143,7 +143,7 @@ def test_a_case_may_bring_the_priors_of_its_simulators(tmp_path):
     text = narrow_priors(default_priors(PULL_ONLY["drawbar_pull"]).read_text(encoding="utf-8"))
     (folder / "mine.toml").write_text(text, encoding="utf-8")
     with (folder / "case.toml").open("a", encoding="utf-8") as file:
-        file.write('\n[priors]\ndrawbar_pull = "mine.toml"\n')
+        file.write('\n[priors]\ndrawbar_pull = "mine.toml"\n[context]\nsame_soil = false\n')
     case = read_case(folder)
     assert case_files(folder)[1]["priors.drawbar_pull"] == folder / "mine.toml"
     (output,) = campaigns(case).outputs
@@ -151,8 +151,9 @@ def test_a_case_may_bring_the_priors_of_its_simulators(tmp_path):
     found = diagnose_once(case, 1, effects={"force_offset": EFFECTS["force_offset"]})
     (tmp_path / "out").mkdir()
     save_corrected(found.corrected, tmp_path / "out")
-    kept = load_corrected(tmp_path / "out").data.outputs[0].problem.priors
-    assert kept.text == text
+    kept = load_corrected(tmp_path / "out").data
+    assert kept.outputs[0].problem.priors.text == text
+    assert kept.case.context == Context(same_soil=False)
     recorded = json.loads(inputs_record(case, 1))
     assert recorded["priors"] == case_hashes(folder)["priors"]
 

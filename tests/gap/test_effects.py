@@ -11,7 +11,8 @@ import pytest
 
 from calib.data.quantities import role_of
 from calib.gap.effects import EFFECTS, Effect, Known, View
-from calib.gap.effects.dependence import DependsOn, DiffersBy, ReadingDrift, ReadingStep
+from calib.gap.effects.dependence import DependsOn, DiffersBy
+from calib.gap.effects.readings import ConditionBias, Reading
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import Hypothesis, effect_priors
 from calib.inference.prior_files import DeclaredPriors, default_priors, read_priors
@@ -296,11 +297,12 @@ def test_a_dependence_has_its_bounds_and_its_logarithm() -> None:
 
 @pytest.mark.parametrize("role", ["sinkage", "torque"])
 @pytest.mark.parametrize(
-    ("kind", "of_cell"), [(ReadingDrift, "sensor_drift"), (ReadingStep, "sensor_step")]
+    ("kind", "of_cell"),
+    [("drift", "sensor_drift"), ("step", "sensor_step"), ("offset", "force_offset")],
 )
 def test_another_reading_changes_over_the_runs_as_the_drawbar_cells(kind, of_cell, role):
     """By the same equation, and no other output with it."""
-    view, effect = VIEWS["everything recorded"], kind(role, "some_output", "1", 1.0)
+    view, effect = VIEWS["everything recorded"], Reading(kind, role, "some_output", "1", 1.0)
     phi = drawn(effect)
     y = np.random.default_rng(4).normal(2.0, 1.0, (K, N))
     expected = [
@@ -312,6 +314,33 @@ def test_another_reading_changes_over_the_runs_as_the_drawbar_cells(kind, of_cel
     assert effect.on_output(phi, "pull", y, view) is y
     begun = effect.begun(phi, {role: np.full(N, 0.1), "pull": np.full(N, np.nan)}, view)
     assert np.isfinite(begun).all()
+
+
+def test_a_gain_is_a_factor_and_an_offset_is_in_the_readings_unit_in_logarithms_too():
+    view, y = VIEWS["everything recorded"], np.random.default_rng(4).uniform(1.0, 4.0, (1, N))
+    five, two = np.array([[0.05]]), np.array([[2.0]])
+    gain, offset = (Reading(k, "sinkage", "rut_depth", "mm", 25.0) for k in ("gain", "offset"))
+    np.testing.assert_allclose(gain.on_output(five, "sinkage", y, view), 1.05 * y, rtol=1e-14)
+    logs = [Reading(k, "sinkage", "r", "mm", 25.0, log=True) for k in ("gain", "offset")]
+    for log, natural, phi in zip(logs, (gain, offset), (five, two), strict=True):
+        read = natural.on_output(phi, "sinkage", np.exp(y), view)
+        np.testing.assert_allclose(log.on_output(phi, "sinkage", y, view), np.log(read))
+    low = logs[1].on_output(np.array([[-1e3]]), "sinkage", y, view)
+    np.testing.assert_allclose(low, y + np.log(0.05))
+    assert [p.scale for e in (gain, offset) for p in priors_of(e).free] == [0.05, 2.5]
+
+
+def test_a_wrong_condition_has_a_gain_and_an_offset_and_its_sign():
+    effect = ConditionBias("load", "normal_load", ("pull",), "kN", 5.0)
+    load, phi = np.array([4.0, 6.0, -1.0]), np.array([[0.05, 0.2], [0.0, -50.0]])
+    given = {"load": load, "slip": np.zeros(3)}
+    view = VIEWS["everything recorded"]
+    true = effect.on_conditions(phi, "pull", given, view)
+    np.testing.assert_allclose(true["load"], [[4.4, 6.5, -0.85], [0.08, 0.12, -51.0]])
+    assert true["slip"] is given["slip"]
+    slip = {"slip": given["slip"]}
+    assert effect.on_conditions(phi, "pull", slip, view) is slip
+    assert [p.scale for p in priors_of(effect).free] == [0.05, 0.25]
 
 
 def priors_of(effect: Effect) -> Priors:

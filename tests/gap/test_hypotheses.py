@@ -11,15 +11,17 @@ import pytest
 from calib.data import table_from_arrays
 from calib.gap.campaigns import campaigns
 from calib.gap.case import Case, Context
-from calib.gap.constants import SHIFTS
+from calib.gap.constants import SELDOM, SHIFTS
 from calib.gap.describe import unlisted
 from calib.gap.diagnose import diagnose, diagnose_once
 from calib.gap.effects import EFFECTS
+from calib.gap.forward import Forward
 from calib.gap.hypotheses import (
     Hypothesis,
     dependences,
     effect_priors,
     inseparable,
+    prior_share,
     readings,
     shifts,
     singles,
@@ -237,24 +239,70 @@ def test_declared_columns_may_change_every_output():
     assert not inseparable(little, found["temperature"])
 
 
-def test_every_reading_but_the_drawbar_cells_may_drift_or_jump_in_its_own_unit(data):
-    """Of ruts, whose logarithms are compared, by a factor; else by parts of a typical reading."""
+def test_every_reading_may_be_wrong_in_its_own_unit(data):
+    """Over the runs ruts, whose logarithms are compared, by a factor; else by parts of a reading.
+
+    What the drawbar cell's own effects are about is not counted twice.
+    """
     found = readings(data)
-    assert set(found) == {"rut_depth_drift", "rut_depth_step"}
-    assert [effect.outputs for effect in found.values()] == [("sinkage",)] * 2
+    assert found.pop("drawbar_pull_gain").outputs == ("pull",)
+    assert set(found) == {f"rut_depth_{kind}" for kind in ("drift", "step", "gain", "offset")}
+    assert {effect.outputs for effect in found.values()} == {("sinkage",)}
+    assert all(prior_share(effect, ()) == SELDOM for effect in found.values())
+    offset = effect_priors(data, found["rut_depth_offset"]).free[0]
+    typical = np.median(np.exp(data.outputs[1].problem.response))
+    assert (offset.unit, offset.scale) == ("mm", pytest.approx(0.1 * typical))
     sizes = {name: [p.scale for p in effect_priors(data, e).free if p.name in _SIZES]
              for name, e in found.items()}  # fmt: skip
-    assert sizes == {"rut_depth_drift": [0.25], "rut_depth_step": [0.25]}
+    assert sizes["rut_depth_drift"] == sizes["rut_depth_step"] == [0.25]
     dense = campaigns(density_campaigns())
-    assert not readings(dense)  # nothing is known of the order of its runs
+    # Nothing is known of the order of its runs.
+    assert set(readings(dense)) == {"bulk_density_gain", "bulk_density_offset"}
     (o,) = dense.outputs
     order = {"run_order": np.arange(len(dense.case.field), dtype=float)}
     timed = campaigns(
         replace(dense.case, field=table_from_arrays({**dense.case.field.columns, **order}))
     )
     found = readings(timed)
-    assert set(found) == {"bulk_density_drift", "bulk_density_step"}
+    assert {"bulk_density_drift", "bulk_density_step"} < set(found)
     drift = effect_priors(timed, found["bulk_density_drift"]).free[0]
     assert (drift.unit, drift.scale) == (
         "g/cm**3", pytest.approx(0.25 * np.median(o.problem.response)),
     )  # fmt: skip
+
+
+def test_a_gain_of_five_percent_is_predicted_and_only_conditions_that_differ_may_be_wrong(data):
+    """By the simulator, of pulls as of ruts in logarithms."""
+    sigma = {o: NOISE[o] for o in data.names}
+    for name, gained in (
+        ("drawbar_pull", lambda y: 1.05 * y),
+        ("rut_depth", lambda y: y + np.log(1.05)),
+    ):
+        effect = readings(data)[f"{name}_gain"]
+        forward = Forward(data, Hypothesis(
+            effect.name, (effect,), (effect_priors(data, effect),)), sigma)  # fmt: skip
+        psi = forward.priors.sample(np.random.default_rng(1), 3)
+        psi[:, forward.phi_slices[0]] = 0.05
+        full, plain = forward.field_and_plain(psi, data.view)
+        for o in data.names:
+            expected = gained(plain[o]) if o == name else plain[o]
+            np.testing.assert_allclose(full[o], expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("varied", [True, False])
+def test_a_condition_of_a_simulator_may_be_wrong_if_it_varies(varied):
+    """Of those that no listed gauge is about; what is always the laboratory's is left alone."""
+    case = with_load(
+        np.full(24, 5.0), np.linspace(3.0, 7.0, 24) if varied else np.full(24, 5.0), 1.0
+    )
+    columns = ("tyre_width_m", "tyre_diameter_m")
+    lab, field = (table_from_arrays({**t.columns, **{c: np.full(len(t), 0.5 + i) for i, c in
+                  enumerate(columns)}, "cone_index_kpa": np.linspace(300.0, 500.0, len(t))})
+                  for t in (case.lab, case.field))  # fmt: skip
+    made = campaigns(replace(case, lab=lab, field=field, models={"drawbar_pull": "wismer_luth"}))
+    found = {n: e for n, e in readings(made).items() if n.endswith("_bias")}
+    assert set(found) == ({"normal_load_bias"} if varied else set())
+    for effect in found.values():
+        assert effect.outputs == ("pull",)
+        gain, offset = effect_priors(made, effect).free
+        assert (offset.unit, offset.scale, gain.scale) == ("kN", pytest.approx(0.25), 0.05)

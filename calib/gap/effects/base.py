@@ -188,6 +188,9 @@ class Effect:
         What is known of its shape, an entry for each output of which anything is.
     instrument : bool
         Whether an instrument is at fault, not wheel or soil; predicted with it is what it reads.
+    seldom : bool
+        Whether it is tried by itself only, and less probable than others beforehand; if it goes by
+        run order, where the readings do.
     check : str
         How such an instrument is checked, in words.
     device : str
@@ -209,6 +212,7 @@ class Effect:
     form: tuple[str, ...] = ()
     known: tuple[Known, ...] = ()
     instrument: bool = False
+    seldom: bool = False
     check: str = "zero and span"
     device: str = ""
     priors: str = ""
