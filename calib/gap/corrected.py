@@ -33,7 +33,7 @@ from calib.inference.priors import Priors
 from calib.models.base import Array
 from calib.validation.prediction import echoed, outside
 
-SCHEMA = "calib/corrected/5"
+SCHEMA = "calib/corrected/6"
 
 
 class Corrected:
@@ -151,9 +151,7 @@ def _fit_document(fit: Fit, probability: float) -> dict[str, Any]:
         "smooth_decay": h.smooth_decay,
         "onset_over": h.onset_over,
         "probability": probability,
-        "psi": fit.psi.tolist(),
-        "covariance": fit.covariance.tolist(),
-        "sample": None if fit.sample is None else _short(fit.sample),
+        "sample": _short(fit.sample),
         "field": {o: _short([values])[0] for o, values in _field(fit).items()},
         "noise": {
             o: {"sigma": n.sigma, "rho": n.rho, "kappa": n.kappa} for o, n in fit.noise.items()
@@ -257,13 +255,10 @@ def _load_fit(
     shift = _load_shift(document["shift_map"])
     sigma = {o: n.sigma for o, n in noise.items()}
     forward = Forward(data, hypothesis, sigma, lab_mode, shift)
-    psi, covariance = np.array(document["psi"]), np.array(document["covariance"])
-    if psi.shape != (forward.n_dim,) or covariance.shape != (forward.n_dim, forward.n_dim):
+    sample = np.array(document["sample"])
+    if sample.shape[1:] != (forward.n_dim,):
         raise ValueError("shape")
-    sample = None if document["sample"] is None else np.array(document["sample"])
-    if sample is not None and sample.shape[1:] != psi.shape:
-        raise ValueError("shape")
-    fit = Fit(forward, psi, covariance, noise, 0.0, 0.0, {}, sample)
+    fit = Fit(forward, noise, 0.0, {}, sample)
     for o, values in _field(fit).items():
         said = np.array(document["field"][o])
         if not np.allclose(values, said, rtol=0.0, atol=1e-4 * sigma[o], equal_nan=True):

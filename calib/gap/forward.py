@@ -19,148 +19,106 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.data.quantities import columns_of
 from calib.gap.campaigns import Campaigns
-from calib.gap.constants import FORM_ERROR, MISFIT
+from calib.gap.constants import FORM_ERROR, MISFIT, WIDE
 from calib.gap.discrepancy import THRESHOLDS, Discrepancy, ShiftMap, shift_map
 from calib.gap.effects import Effect, View
-from calib.gap.hypotheses import Hypothesis
+from calib.gap.hypotheses import Hypothesis, widened
 from calib.inference.priors import Prior, Priors
+from calib.inference.random import latin
 from calib.models.base import Array
 
-# Effects to leave out, by their place, of those asked for, by their place.
-type LeftOut = Mapping[int, Collection[int]]
-type _Rows = slice | NDArray[np.int64]
+# A prediction without a value is none, whatever the warnings.
+_SILENT = np.errstate(all="ignore")
 
 
 class FieldPrediction:
-    """Field rows under hypotheses on the same campaigns, with form errors that may change later.
+    """Field rows under a hypothesis, with form errors that may change later.
 
-    An effect is evaluated once for all hypotheses that have it: for few rows at a time a call takes
-    longer than its arithmetic. The conditions that truly held do not depend on the form errors.
+    The conditions that truly held do not depend on them.
+
+    Parameters
+    ----------
+    forward : Forward
+    psi : ndarray, shape (k, d)
+    plain : dict of str to ndarray, shape (k, n)
+        What the simulators predict there.
+    idle : collection of int, optional
+        Effects that do not act, by their place.
     """
 
-    @np.errstate(all="ignore")
+    @_SILENT
     def __init__(
         self,
-        asked: Sequence[tuple[Forward, Array]],
+        forward: Forward,
+        psi: Array,
         view: View,
         plain: dict[str, Array],
-        idle: LeftOut | None = None,
+        idle: Collection[int] = (),
     ) -> None:
-        self._view, self._plain = view, plain
-        ends = np.cumsum([len(psi) for _, psi in asked]).tolist()
-        self._parts = [
-            (forward, slice(end - len(psi), end))
-            for (forward, psi), end in zip(asked, ends, strict=True)
-        ]
-        self._acting = _acting(self._parts, [psi for _, psi in asked], view, plain, idle or {})
-        self._added: dict[str, list[Array | None]] = {}
-        if self._acting:
-            forward = asked[0][0]
-            shared = np.concatenate([psi[:, : forward.n_shared] for _, psi in asked])
-            self._added = {
-                o: _added(forward, shared, o, view, self._acting, plain[o]) for o in plain
-            }
+        self._forward, self._view, self._plain = forward, view, plain
+        base = {
+            o.role: o.problem.bound.from_response(plain[o.name])
+            for o in (forward.data.outputs if forward.hypothesis.effects else ())
+        }
+        self._acting = _acting(forward, psi, view.with_base(base), idle)
+        self._added = {
+            o: _added(forward, psi, o, view, self._acting, plain[o])
+            for o in (plain if self._acting else ())
+        }
 
-    @np.errstate(all="ignore")
-    def at(self, psi: Sequence[Array], without: int | None = None) -> dict[str, Array]:
-        """Predict with the form errors and discrepancies in psi of each, shapes (k, d).
+    @_SILENT
+    def at(self, psi: Array, without: int | None = None) -> dict[str, Array]:
+        """Predict with the form errors and discrepancies in psi, shape (k, d).
 
         Without what one of the effects adds, by its place, though the others see that it acts.
         """
-        acting = {
-            j: (a, self._factors(a, psi))
-            for j, a in enumerate(self._acting)
-            if a.having[0][1] != without
-        }
+        forward = self._forward
+        forms = forward.form(self._view)
         changed = dict(self._plain)
-        for name, role in self._parts[0][0].roles.items():
-            of_it = [
-                (a, factors[name], self._added[name][j])
-                for j, (a, factors) in acting.items()
-                if name in factors
-            ]
+        for name, role in forward.roles.items():
+            of_it = []
+            for a, added in zip(self._acting, self._added.get(name, ()), strict=False):
+                if a.place != without and role in a.effect.outputs:
+                    form = psi[:, forward.form_slices[name][a.place]]
+                    of_it.append((a, np.maximum(1.0 + form @ forms[a.place].T, 0.0), added))
             if of_it:
                 changed[name] = _changed(self._plain[name], role, of_it)
-        for (forward, rows), own in zip(self._parts, psi, strict=True):
-            threshold = own[:, forward.threshold :].ravel()  # of one that sets in, else empty
-            for name, part in forward.smooth_slices.items():
-                if changed[name] is self._plain[name]:
-                    changed[name] = changed[name].copy()
-                smooth = forward.discrepancy.at(own[:, part], threshold, self._view, name)
-                changed[name][rows] += smooth
+        threshold = psi[:, forward.threshold :].ravel()  # of one that sets in, else empty
+        for name, part in forward.smooth_slices.items():
+            smooth = forward.discrepancy.at(psi[:, part], threshold, self._view, name)
+            changed[name] = changed[name] + smooth
         return changed
-
-    def _factors(self, acting: _Acting, psi: Sequence[Array]) -> dict[str, Array]:
-        """By how much an effect departs from its formula in each output that it touches.
-
-        One plus what its form errors say, but for what is known of it: its sign, and where it is
-        nothing.
-        """
-        forwards = [f for f, _ in self._parts]
-        part, place = acting.having[0]
-        basis = forwards[part].form(self._view)[place]
-        found = {}
-        for name, role in forwards[part].roles.items():
-            if role in acting.effect.outputs:
-                form = [psi[j][:, forwards[j].form_slices[name][i]] for j, i in acting.having]
-                factor = (form[0] if len(form) == 1 else np.concatenate(form)) @ basis.T
-                factor += 1.0
-                found[name] = np.maximum(factor, 0.0, out=factor)
-        return found
 
 
 @dataclass(frozen=True)
 class _Acting:
-    """An effect in some rows: its natural parameters there, and what it sees.
-
-    Which hypotheses have it, and its place in each.
-    """
+    """An effect, its place, its natural parameters and what it sees."""
 
     effect: Effect
-    having: Sequence[tuple[int, int]]
-    rows: _Rows
+    place: int
     phi: Array
     view: View
 
 
-def _acting(
-    parts: Sequence[tuple[Forward, slice]],
-    psi: Sequence[Array],
-    view: View,
-    plain: Mapping[str, Array],
-    idle: LeftOut,
-) -> list[_Acting]:
-    """Effects, each once: what happens first, then what instruments make of it, by name."""
-    places: dict[str, list[tuple[int, int]]] = {}
-    for j, (forward, _) in enumerate(parts):
-        for i, effect in enumerate(forward.hypothesis.effects):
-            if i not in idle.get(j, ()):
-                places.setdefault(effect.name, []).append((j, i))
-    found: list[_Acting] = []
-    if not places:
-        return found
-    outputs = parts[0][0].data.outputs
-    base = {o.role: o.problem.bound.from_response(plain[o.name]) for o in outputs}
-    for having in places.values():
-        j, i = having[0]
-        hypothesis = parts[j][0].hypothesis
-        phi = np.concatenate([psi[j][:, parts[j][0].phi_slices[i]] for j, i in having])
-        rows: _Rows = parts[j][1]
-        if len(having) > 1:
-            of_each = (parts[j][1] for j, _ in having)
-            rows = np.concatenate([np.arange(part.start, part.stop) for part in of_each])
-        natural = hypothesis.effect_priors[i].to_natural(phi)
-        found.append(_Acting(hypothesis.effects[i], having, rows, natural, _seen(view, base, rows)))
+def _acting(forward: Forward, psi: Array, view: View, idle: Collection[int]) -> list[_Acting]:
+    """Effects: what happens first, then what instruments make of it, by name."""
+    h = forward.hypothesis
+    found = [
+        _Acting(effect, i, priors.to_natural(psi[:, part]), view)
+        for i, (effect, priors, part) in enumerate(
+            zip(h.effects, h.effect_priors, forward.phi_slices, strict=True)
+        )
+        if i not in idle
+    ]
     return sorted(found, key=lambda a: (a.effect.instrument, a.effect.name))
 
 
 def _added(
     forward: Forward,
-    shared: Array,
+    psi: Array,
     name: str,
     view: View,
     acting: Sequence[_Acting],
@@ -168,32 +126,22 @@ def _added(
 ) -> list[Array | None]:
     """What each effect adds to one output by the conditions that truly held, by its formula."""
     role, simulated = forward.roles[name], forward.simulated[name]
-    t, misfit = shared[:, forward.theta_slices[name]], shared[:, forward.misfit_slices[name]]
+    t, misfit = psi[:, forward.theta_slices[name]], psi[:, forward.misfit_slices[name]]
     recorded = simulated.conditions(view)
     conditions = {known: recorded[column] for known, column in simulated.columns.items()}
-    truly: dict[str, Array] = {}
-    ahead = plain.copy()
+    ahead = plain
     added: list[Array | None] = []
     for a in acting:
         added.append(None)
         if role not in a.effect.outputs:
             continue
-        given = {
-            known: truly[known][a.rows] if known in truly else values
-            for known, values in conditions.items()
-        }
-        found = a.effect.on_conditions(a.phi, role, given, a.view)
-        if found is given:
+        found = a.effect.on_conditions(a.phi, role, dict(conditions), a.view)
+        if all(found[known] is values for known, values in conditions.items()):
             continue
         at = {simulated.columns[known]: values for known, values in found.items()}
-        there = simulated.predict_beyond(t[a.rows], misfit[a.rows], at)
-        added[-1] = there - ahead[a.rows]
-        ahead[a.rows] = there
-        for known, values in found.items():
-            if values is not given[known]:
-                if known not in truly:
-                    truly[known] = np.tile(conditions[known], (len(plain), 1))
-                truly[known][a.rows] = values
+        there = simulated.predict_beyond(t, misfit, at)
+        added[-1] = there - ahead
+        ahead, conditions = there, found
     return added
 
 
@@ -206,29 +154,17 @@ def _changed(
     of its own.
     """
     mean = plain.copy()
-    for a, factor, added in acting:
+    for _, factor, added in acting:
         if added is not None:
-            mean[a.rows] += added * factor
+            mean += added * factor
     for a, factor, _ in acting:
-        here = mean[a.rows]
-        changed = a.effect.on_output(a.phi, role, here, a.view)
-        if changed is not here:
-            change = changed - here
-            change *= factor
+        changed = a.effect.on_output(a.phi, role, mean, a.view)
+        if changed is not mean:
+            change = (changed - mean) * factor
             if any(k.at_most and k.output == role for k in a.effect.known):
-                np.maximum(change, -a.effect.most(a.phi, role, here, a.view), out=change)
-            change += here
-            mean[a.rows] = change
+                change = np.maximum(change, -a.effect.most(a.phi, role, mean, a.view))
+            mean = mean + change
     return mean
-
-
-def _seen(view: View, base: Mapping[str, Array], rows: _Rows) -> View:
-    """What an effect can see of some rows of what simulators predict."""
-    return view.with_base({role: values[rows] for role, values in base.items()})
-
-
-# A prediction without a value is none, whatever the warnings.
-_SILENT = np.errstate(all="ignore")
 
 
 class Forward:
@@ -317,6 +253,35 @@ class Forward:
         """Length of psi."""
         return len(self.priors.free)
 
+    @cached_property
+    def _sizes(self) -> list[tuple[slice, Priors, Priors]]:
+        """Effects whose size is not known: their place, usual priors and wide ones."""
+        h, known = self.hypothesis, self.data.case.context.sizes
+        return [
+            (part, priors, widened(priors))
+            for e, priors, part in zip(h.effects, h.effect_priors, self.phi_slices, strict=True)
+            if e.name not in known and priors.free
+        ]
+
+    def log_prior(self, psi: Array) -> Array:
+        """Log prior density, shape (k,): of sizes a mixture of the usual priors and wide ones."""
+        value = self.priors.log_prob(psi)
+        inside = np.isfinite(value)
+        for part, usual, wide in self._sizes:
+            t = psi[inside, part]
+            denser = wide.log_prob(t) - usual.log_prob(t)
+            value[inside] += np.logaddexp(np.log1p(-WIDE), np.log(WIDE) + denser)
+        return value
+
+    def prior_draws(self, rng: np.random.Generator, size: int) -> Array:
+        """Draw from the prior by a Latin hypercube, shape (size, d)."""
+        u = latin(rng, size, self.n_dim)
+        psi = self.priors.ppf(u)
+        for part, _, wide in self._sizes:
+            rows = rng.random(size) < WIDE
+            psi[rows, part] = wide.ppf(u[rows, part])
+        return psi
+
     def form(self, view: View) -> list[Array]:
         """Basis of each effect's form error, shapes (n, m)."""
         if view.conditions is self.data.view.conditions:
@@ -373,10 +338,8 @@ class Forward:
     @_SILENT
     def campaigns(self, psi: Array) -> tuple[dict[str, Array], dict[str, Array]]:
         """Predict the lab rows and the field rows, as `lab` and `field` do."""
-        if self.shift is not None:
-            return self.lab(psi), self.field(psi, self.data.view)
         lab, plain = self.plain(psi)
-        return lab, fields_of_all([(self, psi)], self.data.view, plain)
+        return lab, self.acting(psi, self.data.view, plain).at(psi)
 
     @_SILENT
     def plain(self, psi: Array) -> tuple[dict[str, Array], dict[str, Array]]:
@@ -404,75 +367,44 @@ class Forward:
         names += ["parameter_shift"] if self.shift is not None else []
         return (*names, *(["unknown"] if self.smooth_slices else []))
 
-    def left_out(self, psi: Array, *causes: str) -> tuple[Array, list[int]]:
-        """Psi without some of `causes`, and effects that are idle then, by their place."""
-        rest = psi.copy()
-        if "parameter_shift" in causes:
-            rest[:, self.shift_slice] = 0.0
-        if "unknown" in causes:
-            for part in self.smooth_slices.values():
-                rest[:, part] = 0.0
-        return rest, [i for i, e in enumerate(self.hypothesis.effects) if e.name in causes]
-
+    @_SILENT
     def without(self, psi: Array, view: View, *left_out: str) -> dict[str, Array]:
         """Predict field rows with all of `causes` in force but some."""
-        rest, idle = self.left_out(psi, *left_out)
+        rest = psi.copy()
+        if "parameter_shift" in left_out:
+            rest[:, self.shift_slice] = 0.0
+        if "unknown" in left_out:
+            for part in self.smooth_slices.values():
+                rest[:, part] = 0.0
+        idle = [i for i, e in enumerate(self.hypothesis.effects) if e.name in left_out]
         plain = {} if self.shift is not None else self.simulator(psi, view)
-        return fields_of_all([(self, rest)], view, plain, {0: idle})
+        return self.acting(rest, view, plain, idle).at(rest)
+
+    @_SILENT
+    def acting(
+        self, psi: Array, view: View, plain: dict[str, Array], idle: Collection[int] = ()
+    ) -> FieldPrediction:
+        """Prepare field rows, of which `plain` is what the simulators say without a shift."""
+        if self.shift is not None:
+            shift, error = (
+                psi[:, self.shift_slice],
+                psi[:, self.shift_slice] @ self.shift.radius_error,
+            )
+            plain = {
+                name: s.predict(
+                    psi[:, self.theta_slices[name]] + shift @ self.shift.parameters[name].T,
+                    psi[:, self.misfit_slices[name]],
+                    _shifted(error, s.conditions(view)),
+                )
+                for name, s in self.simulated.items()
+            }
+        return FieldPrediction(self, psi, view, plain, idle)
 
     @_SILENT
     def field_and_plain(self, psi: Array, view: View) -> tuple[dict[str, Array], dict[str, Array]]:
         """Predict as `field` and as `simulator` do."""
         plain = self.simulator(psi, view)
-        return fields_of_all([(self, psi)], view, plain), plain
-
-
-@_SILENT
-def fields_of_all(
-    asked: Sequence[tuple[Forward, Array]],
-    view: View,
-    plain: dict[str, Array],
-    idle: LeftOut | None = None,
-) -> dict[str, Array]:
-    """Predict field rows under hypotheses on the same campaigns.
-
-    Parameters
-    ----------
-    asked : sequence of (Forward, ndarray)
-        With psi of each, shape (k, d).
-    plain : dict of str to ndarray, shape (sum of k, n)
-        What the simulators predict there; those with a shift are evaluated anew.
-    idle : mapping of int to collection of int, optional
-        Effects to leave out, by their place, of one of those asked, by its place.
-    """
-    shifted = [part for part in asked if part[0].shift is not None]
-    if shifted:
-        there = _shifted_of_all(shifted, view)
-        if len(shifted) < len(asked):
-            of_it = np.concatenate([np.full(len(psi), f.shift is not None) for f, psi in asked])
-            plain = {name: values.copy() for name, values in plain.items()}
-            for name, values in there.items():
-                plain[name][of_it] = values
-        else:
-            plain = there
-    return FieldPrediction(asked, view, plain, idle).at([psi for _, psi in asked])
-
-
-def _shifted_of_all(asked: Sequence[tuple[Forward, Array]], view: View) -> dict[str, Array]:
-    """Predict field rows with the simulators at the shifted parameters of hypotheses."""
-    some, _ = asked[0]
-    shared = np.concatenate([psi[:, : some.n_shared] for _, psi in asked])
-    shifts = [(f.shift, psi[:, f.shift_slice]) for f, psi in asked if f.shift is not None]
-    errors = np.concatenate([shift @ by.radius_error for by, shift in shifts])
-    found: dict[str, Array] = {}
-    for name, s in some.simulated.items():
-        moved = np.concatenate([shift @ by.parameters[name].T for by, shift in shifts])
-        found[name] = s.predict(
-            shared[:, some.theta_slices[name]] + moved,
-            shared[:, some.misfit_slices[name]],
-            _shifted(errors, s.conditions(view)),
-        )
-    return found
+        return self.acting(psi, view, plain).at(psi), plain
 
 
 def _shifted(radius_error: Array, conditions: dict[str, Array]) -> dict[str, Array]:

@@ -23,7 +23,6 @@ from calib.gap.constants import (
     SOIL,
     UNDERINFLATED,
     UNUSUAL_SIZE,
-    WIDE,
     WIDER,
     WIDER_LOG,
 )
@@ -343,20 +342,8 @@ def with_residual_discrepancy(data: Campaigns, causes: Hypothesis) -> list[Hypot
     ]
 
 
-def resized(causes: Hypothesis, usual: Mapping[str, Priors], large: Collection[str]) -> Hypothesis:
-    """Return a hypothesis with widened size priors for some of its effects."""
-    names = [e.name for e in causes.effects]
-    were = sum(p != usual[n] for n, p in zip(names, causes.effect_priors, strict=True))
-    priors = tuple(_wide(usual[n]) if n in large else usual[n] for n in names)
-    return replace(causes, effect_priors=priors, share=causes.share * WIDE ** (len(large) - were))
-
-
-def wider(single: Hypothesis) -> Hypothesis:
-    """Return an effect whose size may be several times as large as its prior says."""
-    return resized(single, {single.name: single.effect_priors[0]}, [single.name])
-
-
-def _wide(priors: Priors) -> Priors:
+def widened(priors: Priors) -> Priors:
+    """Return the priors of an effect that may be several times as large as it usually is."""
     entries = tuple(
         p if p.fixed else replace(p, scale=p.scale * (WIDER_LOG if p.log else WIDER))
         for p in priors.entries

@@ -153,8 +153,6 @@ def _thinned(fit: Fit) -> Fit:
 
     They are in the order of the pool that they were picked from: every third stands for all.
     """
-    if fit.sample is None:
-        return fit
     return replace(fit, sample=fit.sample[:: max(len(fit.sample) // 500, 1)])
 
 

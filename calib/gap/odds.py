@@ -26,12 +26,10 @@ where there is no gap, 1.1 for one of four noise sds, 1.36 from 7.5 on.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import batched
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from calib.gap.campaigns import Campaigns
@@ -46,52 +44,17 @@ from calib.gap.constants import (
     RESIDUAL_DISCREPANCY,
 )
 from calib.gap.fit import Fit
-from calib.gap.forward import Forward, fields_of_all
+from calib.gap.forward import Forward
 from calib.gap.noise import Noise
-from calib.inference.random import generator, latin
 from calib.models.base import Array
 
 
-def ln_size_restriction(asked: Sequence[tuple[Fit, int]], seed: int) -> list[float]:
-    """Log of the factor by which requiring a minimum size changes hypotheses' evidence."""
-    known = [i for i, (f, n) in enumerate(asked) if n and f.forward.hypothesis.name != "none"]
-    drawn = [psi for i in known for psi in _drawn(*asked[i], seed)]
-    fits = [asked[i][0] for i in known for _ in range(2)]
-    found = [0.0] * len(asked)
-    every = sizes_of_all(
-        [(fit.forward, fit.noise, psi) for fit, psi in zip(fits, drawn, strict=True)]
-    )
-    for i, (posterior, prior) in zip(known, batched(every, 2), strict=True):
-        found[i] = _log_share(posterior)
-        # What is relevant in no draw of the prior is no likelier for being restricted to that.
-        if _relevant(prior).any():
-            found[i] -= _log_share(prior)
-    return found
-
-
-def _drawn(fit: Fit, draws: int, seed: int) -> tuple[Array, Array]:
-    """Psi of the posterior, and of the prior of the effect about the simulator as it was fitted."""
-    rng = generator(seed, "gap", "relevance", fit.forward.hypothesis.name)
-    # Of a sample each draw once: again it would say nothing new.
-    posterior = fit.draws(rng, draws) if fit.sample is None else fit.sample
-    prior = np.repeat(fit.psi[None], draws, axis=0)
-    first_effect = fit.forward.n_shared
-    drawn = fit.forward.priors.ppf(latin(rng, draws, fit.forward.n_dim))
-    prior[:, first_effect:] = drawn[:, first_effect:]
-    return posterior, prior
-
-
-def _log_share(size: Array) -> float:
-    relevant = _relevant(size)
-    return float(np.log((relevant.sum() + 0.2) / (relevant.size + 0.4)))
-
-
-def _relevant(size: Array) -> NDArray[np.bool_]:
-    """Which draws are relevant, of those for which the model has a value."""
-    # Those for which it has none say nothing either way.
+def ln_relevant(size: Array) -> float:
+    """Log of the part of draws, by the sizes of their causes, in which all causes count."""
+    # Draws for which the model has no value say nothing either way.
     size = size[np.isfinite(size).all(axis=1)]
     threshold = MIN_EFFECT_SIZE if size.shape[1] == 1 else MIN_EFFECT_SIZE_IN_PAIR
-    return np.asarray((size >= threshold).all(axis=1))
+    return float(np.log(((size >= threshold).all(axis=1).sum() + 0.2) / (len(size) + 0.4)))
 
 
 def sizes(forward: Forward, noise: Mapping[str, Noise], psi: Array) -> Array:
@@ -103,70 +66,18 @@ def sizes(forward: Forward, noise: Mapping[str, Noise], psi: Array) -> Array:
     A discrepancy of several outputs is as large as in the output where it is smallest: what changes
     one output only is not one of several.
     """
-    return sizes_of_all([(forward, noise, psi)])[0]
-
-
-def sizes_of_all(asked: Sequence[tuple[Forward, Mapping[str, Noise], Array]]) -> list[Array]:
-    """Sizes of the causes of hypotheses on the same campaigns, as `sizes` has them.
-
-    Effects are asked once for many: of few rows at a time that takes longer than the arithmetic.
-    """
-    found: list[list[Array]] = [[] for _ in asked]
-    batch: list[tuple[int, Array]] = []
-    room = 1024
-
-    def ask() -> None:
-        parts = [(*asked[i][:2], psi) for i, psi in batch]
-        for (i, _), size in zip(batch, _sizes(parts) if parts else (), strict=True):
-            found[i].append(size)
-        batch.clear()
-
-    for i, (forward, _, psi) in enumerate(asked):
-        each = 1 + len(forward.causes)
-        for some in np.array_split(psi, max(1, -(-len(psi) * each // 1024))):
-            if len(some) * each > room:
-                ask()
-                room = 1024
-            batch.append((i, some))
-            room -= len(some) * each
-    ask()
-    return [np.concatenate(parts) for parts in found]
-
-
-def _sizes(asked: Sequence[tuple[Forward, Mapping[str, Noise], Array]]) -> list[Array]:
-    some, _, _ = asked[0]
-    data, view = some.data, some.data.view
-    # Every hypothesis, and if it has several causes it without each.
-    parts: list[tuple[Forward, Array]] = []
-    idle: dict[int, list[int]] = {}
-    places = []
-    for forward, _, psi in asked:
-        places.append([len(parts)])
-        parts.append((forward, psi))
-        for cause in forward.causes if len(forward.causes) > 1 else ():
-            rest, idle[len(parts)] = forward.left_out(psi, cause)
-            places[-1].append(len(parts))
-            parts.append((forward, rest))
-    plain = some.simulator(np.concatenate([psi[:, : some.n_shared] for _, psi in parts]), view)
-    with np.errstate(all="ignore"):
-        full = fields_of_all(parts, view, plain, idle)
-    ends = np.cumsum([len(psi) for _, psi in parts]).tolist()
-    rows = [slice(end - len(psi), end) for (_, psi), end in zip(parts, ends, strict=True)]
-    found = []
-    for (forward, noise, _), (at, *without) in zip(asked, places, strict=True):
-        others = [{o: v[rows[j]] for o, v in full.items()} for j in without]
-        others = others or [{o: v[rows[at]] for o, v in plain.items()}]
-        columns: list[Array] = []
-        for other in others:
-            change = {o: full[o][rows[at]] - v for o, v in other.items()}
-            each = _rms(data, noise, change)
-            smooth = forward.hypothesis.smooth_outputs
-            if not without and len(smooth) > 1:
-                columns.append(np.stack([each[n] for n in smooth]).min(axis=0))
-            else:
-                columns.append(np.stack(list(each.values())).max(axis=0))
-        found.append(np.stack(columns, axis=1))
-    return found
+    data, view = forward.data, forward.data.view
+    full, plain = forward.field_and_plain(psi, view)
+    columns: list[Array] = []
+    for cause in forward.causes:
+        other = forward.without(psi, view, cause) if len(forward.causes) > 1 else plain
+        each = _rms(data, noise, {name: full[name] - other[name] for name in full})
+        smooth = forward.hypothesis.smooth_outputs
+        if len(forward.causes) == 1 and len(smooth) > 1:
+            columns.append(np.stack([each[name] for name in smooth]).min(axis=0))
+        else:
+            columns.append(np.stack(list(each.values())).max(axis=0))
+    return np.stack(columns, axis=1)
 
 
 def gap_size(fit: Fit) -> float:
@@ -247,10 +158,3 @@ class Odds:
 
 def _logit(p: float) -> float:
     return float(np.log(p / (1.0 - p)))
-
-
-def with_prior(found: Fit, odds: Odds) -> float:
-    """Log of evidence times the prior of a variant of a hypothesis."""
-    hypothesis = found.forward.hypothesis
-    prior = odds.ln_prior(hypothesis.name) + float(np.log(hypothesis.share))
-    return found.log_evidence + prior

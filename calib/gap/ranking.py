@@ -1,8 +1,8 @@
-"""Rank all hypotheses: fit them, turn evidence into probabilities."""
+"""Rank all hypotheses: screen them, draw their posteriors, turn evidence into probabilities."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,66 +11,38 @@ from scipy.special import logsumexp
 from calib.errors import CalibError, meant
 from calib.gap.campaigns import Campaigns, OutputData
 from calib.gap.case import Context
-from calib.gap.constants import FOLLOWS_RUNS, PLENTY, SEARCH
+from calib.gap.constants import PLENTY
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.fit import Fit
 from calib.gap.hypotheses import (
     Hypothesis,
+    joined,
     prior_share,
     shifts,
     singles,
     split_testable,
-    wider,
+    unknowns,
     with_case_effects,
     with_known_size,
+    with_residual_discrepancy,
 )
 from calib.gap.identifiability import Identifiability, identifiability
-from calib.gap.importance import refine
 from calib.gap.noise import Noise
 from calib.gap.odds import (
     Odds,
     gap_size,
     likelihood_tempering,
-    ln_size_restriction,
+    ln_relevant,
     probabilities,
-    with_prior,
+    sizes,
 )
-from calib.gap.search import StartingPoints, search_sets, unusually_large
+from calib.gap.posterior import sample
+from calib.gap.screen import PARTS, Cause, Choice, Screen
 from calib.inference.mode import find_mode
+from calib.inference.proposal import StudentT
 from calib.inference.random import generator
 from calib.inference.search import check_defined
 from calib.models.base import Array
-
-
-def change_over_runs(residual: Array, order: Array) -> float:
-    """Most by which a straight line or one step over the runs raises the log likelihood.
-
-    The noise is what is left in either case.
-    """
-    z = residual[np.argsort(order, kind="stable")]
-    n, u = z.size, np.arange(z.size) - 0.5 * (z.size - 1)
-    z = z - z.mean()
-    before = np.arange(1, n)
-    of_step = np.square(np.cumsum(z)[:-1]) * n / (before * (n - before))
-    of_line = np.square(u @ z) / np.square(u).sum()
-    total = float(np.square(z).sum())
-    if total <= 1e-20 * float(np.square(residual).sum()):
-        return 0.0
-    part = max(float(of_step.max()), float(of_line)) / total
-    return -0.5 * n * float(np.log(max(1.0 - part, 1e-12)))
-
-
-def follows_runs(data: Campaigns, none: Fit) -> set[str]:
-    """Roles of the outputs whose residuals without a gap change over the runs."""
-    if data.view.column("order") is None:
-        return set()
-    order = data.view.of("order")
-    return {
-        o.role
-        for o in data.outputs
-        if change_over_runs(none.field_residuals[o.name], order[o.rows]) > FOLLOWS_RUNS
-    }
-
 
 # Internal parameters of each simulator, and its noise.
 type Lab = tuple[dict[str, Array], dict[str, Noise]]
@@ -160,8 +132,8 @@ def rank(
     lab_mode, noise = lab or calibrate_lab(data, seed)
     single = singles(data, able)
     shares = {h.name: prior_share(h.effects[0], able) for h in single}
-    beside = {name for name, share in shares.items() if share is not None}
-    listed = [h for h in single if h.name not in beside]
+    alone = {name for name, share in shares.items() if share is not None}
+    listed = [h for h in single if h.name not in alone]
     design = design or identifiability(data, listed, lab_mode, noise, seed)
     single = [h for h in single if h.name not in design.idle]
     unable |= dict.fromkeys(design.idle, "it changes nothing that the models of this case predict")
@@ -170,41 +142,117 @@ def rank(
     _check_names(context, {*able, *unable})
     single = [with_known_size(h, context) for h in single if h.name not in context.excluded]
     unable |= dict.fromkeys(context.excluded, "it is excluded in the case's [context]")
-    beside -= set(context.excluded)
-    odds = Odds.of(len(single) - len(beside), context)
-    guesses = StartingPoints(data, lab_mode, noise, odds)
-    asked = [h for h in single if not (h.effects[0].seldom and "order" in h.effects[0].covariates)]
-    fits = guesses.fit([Hypothesis("none"), *shifts(data), *asked])
-    following = follows_runs(data, fits["none"][0])
-    readings = [h for h in single if h not in asked]
-    single = asked + [
-        h for h in readings if h.name in context.names or following & set(h.effects[0].outputs)
-    ]
-    fits |= guesses.fit(single[len(asked) :])
-    # A size that is known is not several times as large.
-    free = [h for h in single if h.name not in context.sizes]
-    far = [h for h in free if unusually_large(fits[h.name][0], 0, h.effect_priors[0])]
-    for name, more in guesses.fit([wider(h) for h in far]).items():
-        fits[name] += more
-    fits |= search_sets(guesses, [h.name for h in single if h.name not in beside], fits)
-    fits, scores = _scored(fits, guesses.odds, seed, plenty)
+    alone -= set(context.excluded)
+    odds = Odds.of(len(single) - len(alone), context)
+    screen = Screen(data, lab_mode, noise, seed)
+    candidates = _candidates(screen, odds, single, alone)
+    fits, scores = _scored(screen, candidates, odds, seed, plenty)
     log_evidence = {name: float(logsumexp(values)) for name, values in scores.items()}
-    gap = _gap(fits, scores, log_evidence, guesses.odds)
-    probability = probabilities(log_evidence, guesses.odds, likelihood_tempering(gap))
-    return Ranking(
-        fits, scores, log_evidence, probability, unable, lab_mode, design, guesses.odds, gap
-    )
-
-
-def _gap(
-    fits: Mapping[str, tuple[Fit, ...]],
-    scores: Mapping[str, tuple[float, ...]],
-    log_evidence: Mapping[str, float],
-    odds: Odds,
-) -> float:
-    """Size of the gap by the most probable explanation, in noise sds; see `Ranking.gap`."""
     best = max(log_evidence, key=lambda name: log_evidence[name] + odds.ln_prior(name))
-    return gap_size(fits[best][int(np.argmax(scores[best]))])
+    gap = gap_size(fits[best][int(np.argmax(scores[best]))])
+    probability = probabilities(log_evidence, odds, likelihood_tempering(gap))
+    return Ranking(fits, scores, log_evidence, probability, unable, lab_mode, design, odds, gap)
+
+
+# Nats behind the best at which the screen gives a hypothesis up: it was at most 6.3 wrong on 52 cases.
+CUT = 10.0
+# Nats behind the best at which a posterior is drawn until its draws are plenty.
+IN_PLAY = 4.0
+BESIDE = 10  # best listed hypotheses beside which something unlisted is tried
+GUESSES = 3  # best choices of parts that a search begins from
+FIRST, FIRST_ROUNDS = 200.0, (1000,) * 6  # effective draws that a first look asks for; its rounds
+ROUNDS = (2000,) * 7 + (4000,)
+type Chosen = tuple[tuple[Cause, int], ...]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A hypothesis as the screen sees it.
+
+    Parameters
+    ----------
+    promise : float
+        Log of evidence times prior, by the screen.
+    ln_relevant : float
+        Log prior probability that its causes are large enough to count.
+    choices : tuple of (float, tuple of (Cause, int))
+        Log evidence of each choice of a part, by its place, for each of its causes.
+    """
+
+    hypothesis: Hypothesis
+    promise: float
+    ln_relevant: float
+    choices: tuple[tuple[float, Chosen], ...]
+
+    @property
+    def name(self) -> str:
+        """Of the hypothesis."""
+        return self.hypothesis.name
+
+    @classmethod
+    def of(
+        cls, h: Hypothesis, odds: Odds, ln_relevant: float, choices: Iterable[tuple[float, Chosen]]
+    ) -> Candidate:
+        """Add up choices."""
+        every = tuple(choices)
+        promise = float(logsumexp([value for value, _ in every]) + np.log(h.share))
+        return cls(h, promise + odds.ln_prior(h.name), ln_relevant, every)
+
+
+def _candidates(
+    screen: Screen, odds: Odds, single: Sequence[Hypothesis], alone: Collection[str]
+) -> list[Candidate]:
+    """Hypotheses that are near the best by the screen, and every cause by itself."""
+    data, none = screen.data, Hypothesis("none")
+    found = [Candidate.of(none, odds, 0.0, [(screen.ln_evidence(()), ())])]
+    for h in [*shifts(data), *unknowns(data)]:
+        cause = screen.cause(h)
+        by_part = [((cause, i),) for i in range(len(cause.parts))]
+        if by_part:
+            of_parts = [(screen.ln_evidence(c), c) for c in by_part]
+            found.append(Candidate.of(h, odds, cause.ln_relevant, of_parts))
+    causes = {h.name: screen.cause(h) for h in single}
+    groups = dict[tuple[str, ...], list[Choice]]()
+    for choice in [
+        *screen.choices({n: c for n, c in causes.items() if n not in alone}),
+        *screen.choices({n: c for n, c in causes.items() if n in alone}, most=1),
+    ]:
+        groups.setdefault(tuple(sorted(name for name, _ in choice.parts)), []).append(choice)
+    hypotheses = {h.name: h for h in single}
+    for names, group in groups.items():
+        h = joined(*(hypotheses[n] for n in names))
+        some = [causes[n] for n in names]
+        relevant = sum(c.ln_relevant_in_set for c in some)
+        relevant = some[0].ln_relevant if len(some) == 1 else relevant
+        chosen = [(c.ln_evidence, tuple((causes[n], i) for n, i in c.parts)) for c in group]
+        found.append(Candidate.of(h, odds, relevant, chosen))
+    found += _with_residuals(screen, odds, found)
+    least = max(c.promise for c in found) - CUT
+    best = {c.name: c for c in sorted(found, key=lambda c: c.promise)}
+    return [c for c in found if c.promise > least or ("+" not in c.name and best[c.name] is c)]
+
+
+def _with_residuals(screen: Screen, odds: Odds, found: Sequence[Candidate]) -> list[Candidate]:
+    """Candidates near the best listed one, with something unlisted beside their causes."""
+    listed = [c for c in found if c.name not in ("none", "unknown")]
+    least = max((c.promise for c in listed), default=0.0) - CUT
+    residuals = [
+        screen.cause(h) for h in with_residual_discrepancy(screen.data, Hypothesis("none"))
+    ]
+    more = []
+    for c in sorted(listed, key=lambda c: -c.promise)[:BESIDE]:
+        if c.promise < least:
+            break
+        top = sorted(c.choices, key=lambda choice: -choice[0])[:PARTS]
+        for h, rest in zip(
+            with_residual_discrepancy(screen.data, c.hypothesis), residuals, strict=True
+        ):
+            for part in range(len(rest.parts)):
+                with_rest = [(*chosen, (rest, part)) for _, chosen in top]
+                values = [(screen.ln_evidence(chosen), chosen) for chosen in with_rest]
+                relevant = c.ln_relevant + rest.ln_relevant_in_set
+                more.append(Candidate.of(h, odds, relevant, values))
+    return more
 
 
 def _check_names(context: Context, known: set[str]) -> None:
@@ -223,55 +271,52 @@ def _check_names(context: Context, known: set[str]) -> None:
 
 
 def _scored(
-    fits: Mapping[str, tuple[Fit, ...]], odds: Odds, seed: int, plenty: int
+    screen: Screen, candidates: Sequence[Candidate], odds: Odds, seed: int, plenty: int
 ) -> tuple[dict[str, tuple[Fit, ...]], dict[str, tuple[float, ...]]]:
-    """Score every variant, and by draws of their posteriors those that are still in play."""
-    promise = {name: [with_prior(f, odds) for f in group] for name, group in fits.items()}
-    best = max(max(values) for values in promise.values())
+    """Draw every candidate's posterior, and those in play until the draws are plenty."""
+    fits, scores, places = list[Fit](), list[float](), dict[str, list[int]]()
+    proposals = []
 
-    def draws(promised: float) -> int:
-        behind = best - promised
-        if behind < SEARCH.relevance_behind:
-            return 96
-        return 32 if behind < SEARCH.relevance_far else 0
+    def keep(i: int, drawn: tuple[Fit, StudentT], rows: int) -> None:
+        fits[i], proposals[i] = drawn
+        c = candidates[i]
+        scores[i] = fits[i].log_evidence + float(np.log(c.hypothesis.share))
+        if c.choices[0][1]:  # unless nothing acts
+            size = sizes(fits[i].forward, screen.noise, fits[i].sample[::rows])
+            scores[i] += ln_relevant(size) - c.ln_relevant
 
-    every = [(f, draws(p)) for name in fits for f, p in zip(fits[name], promise[name], strict=True)]
-    found = iter(_scores(every, seed))
-    scores = {name: [next(found) for _ in group] for name, group in fits.items()}
-    refined = {name: list(group) for name, group in fits.items()}
-    tried: set[tuple[str, int]] = set()
-    while asked := sorted(_in_play(scores, odds) - tried):
-        tried |= set(asked)
-        for name, i in asked:
-            refined[name][i] = refine(fits[name][i], seed, plenty)
-        again = _scores([(refined[name][i], round(1.5 * plenty)) for name, i in asked], seed)
-        for (name, i), score in zip(asked, again, strict=True):
-            scores[name][i] = score
+    def labelled(i: int, stage: str) -> np.random.Generator:
+        h = candidates[i].hypothesis
+        over = (h.smooth_over, h.onset_over or "", str(h.smooth), str(h.shift), h.shift_as)
+        return generator(seed, "gap", stage, h.name, *over, *h.smooth_outputs)
+
+    for i, c in enumerate(candidates):
+        forward = screen.forward(c.hypothesis)
+        top = sorted(c.choices, key=lambda choice: -choice[0])[:GUESSES]
+        guesses = [(screen.guess(forward, chosen), np.exp(v - top[0][0])) for v, chosen in top]
+        fits.append(None), proposals.append(None), scores.append(0.0)
+        keep(
+            i, sample(forward, screen.noise, guesses, labelled(i, "first"), FIRST, FIRST_ROUNDS), 5
+        )
+        places.setdefault(c.name, []).append(i)
+    done: set[int] = set()
+    while True:
+        ln = np.array([s + odds.ln_prior(c.name) for s, c in zip(scores, candidates, strict=True)])
+        asked = sorted(set(np.flatnonzero(ln > ln.max() - IN_PLAY).tolist()) - done)
+        if not asked:
+            break
+        done |= set(asked)
+        for i in asked:
+            again = [(proposals[i], 1.0)]
+            keep(
+                i,
+                sample(fits[i].forward, fits[i].noise, again, labelled(i, "draws"), plenty, ROUNDS),
+                1,
+            )
     return (
-        {name: tuple(group) for name, group in refined.items()},
-        {name: tuple(values) for name, values in scores.items()},
+        {name: tuple(fits[i] for i in at) for name, at in places.items()},
+        {name: tuple(scores[i] for i in at) for name, at in places.items()},
     )
-
-
-def _in_play(scores: Mapping[str, Sequence[float]], odds: Odds) -> set[tuple[str, int]]:
-    """Names of hypotheses that are in play, and the places of their variants that are."""
-    best = max(max(values) + odds.ln_prior(name) for name, values in scores.items())
-    least = best - SEARCH.in_play
-    return {
-        (name, i)
-        for name, values in scores.items()
-        for i, value in enumerate(values)
-        if value > max(values) - SEARCH.variant_in_play and value + odds.ln_prior(name) > least
-    }
-
-
-def _scores(asked: Sequence[tuple[Fit, int]], seed: int) -> list[float]:
-    """Log of evidence times relevance (if it is drawn) times a variant's share in its name."""
-    relevant = ln_size_restriction(asked, seed)
-    return [
-        f.log_evidence + r + float(np.log(f.forward.hypothesis.share))
-        for (f, _), r in zip(asked, relevant, strict=True)
-    ]
 
 
 def calibrate_lab(data: Campaigns, seed: int) -> Lab:
