@@ -157,10 +157,10 @@ def rank(
 # Nats behind the best at which the screen gives a hypothesis up: it was at most 6.3 wrong on 52 cases.
 CUT = 10.0
 # Nats behind the best at which a posterior is drawn until its draws are plenty.
-IN_PLAY = 4.0
+IN_PLAY = 6.0
 BESIDE = 10  # best listed hypotheses beside which something unlisted is tried
 GUESSES = 3  # best choices of parts that a search begins from
-FIRST, FIRST_ROUNDS = 200.0, (1000,) * 6  # effective draws that a first look asks for; its rounds
+FIRST, FIRST_ROUNDS = 100.0, (1000,) * 4  # effective draws that a first look asks for; its rounds
 ROUNDS = (2000,) * 7 + (4000,)
 type Chosen = tuple[tuple[Cause, int], ...]
 

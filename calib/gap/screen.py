@@ -36,6 +36,8 @@ PARTS = 8  # of an effect
 RANK = 8  # directions of a part in which an effect's rows vary
 BEAM = 100  # choices of parts that are enlarged by one more cause
 MOST_CAUSES = 4
+STEPS = 4
+WIDER = 1.5
 
 
 @dataclass(frozen=True)
@@ -201,9 +203,43 @@ class Screen:
             maps[ours, at], mean[ours] = part.slope[theirs - d], part.psi[theirs - d]
             spread[np.ix_(ours, ours)] = part.spread[np.ix_(theirs - d, theirs - d)]
         u = searched(forward)
-        mean = np.clip(mean + maps @ there, lower, upper)[u]
-        found = (maps @ covariance @ maps.T + spread)[np.ix_(u, u)]
-        return StudentT(mean, np.linalg.cholesky(found + 1e-12 * np.diag(np.diag(found))), DOF)
+        mean, found = self._conditioned(
+            forward, np.clip(mean + maps @ there, lower, upper), maps @ covariance @ maps.T + spread
+        )
+        mean, found = mean[u], found[np.ix_(u, u)]
+        return StudentT(
+            mean, WIDER * np.linalg.cholesky(found + 1e-12 * np.diag(np.diag(found))), DOF
+        )
+
+    def _conditioned(self, forward: Forward, mean: Array, covariance: Array) -> tuple[Array, Array]:
+        """Condition on all rows by regressions of the rows on draws of the guess."""
+        problem = Residuals(self.data, forward)
+        sds, rng = (
+            problem.sds(self.noise),
+            generator(self.seed, "gap", "guess", forward.hypothesis.name),
+        )
+        loc, scale, lower, upper, precision = forward.priors._arrays
+        loc = np.where(precision > 0.0, loc, 0.0)
+        for _ in range(STEPS):
+            root = np.linalg.cholesky(covariance + 1e-10 * np.diag(np.diag(covariance) + 1e-12))
+            psi = np.clip(
+                mean + rng.standard_normal((12 * mean.size, mean.size)) @ root.T, lower, upper
+            )
+            raw = problem.raw(psi) / sds
+            known = np.isfinite(raw).all(axis=1)
+            if known.sum() < 3 * mean.size:
+                break
+            raw, psi = np.clip(raw[known], -1e3, 1e3), psi[known]
+            centre, left = psi.mean(axis=0), raw.mean(axis=0)
+            away = psi - centre
+            width = away.std(axis=0) + 1e-300
+            slope = np.linalg.lstsq(away / width, raw - left, rcond=1e-8)[0] / width[:, None]
+            noise = 1.0 + np.square(raw - left - away @ slope).mean(axis=0)
+            inner = np.diag(precision**2) + (slope / noise) @ slope.T + np.diag(1e-6 / width**2)
+            covariance = np.linalg.inv(inner)
+            pull = precision**2 * (loc - centre) - (slope / noise) @ left
+            mean = np.clip(centre + covariance @ pull, lower, upper)
+        return mean, covariance
 
 
 def _parts(white: Array, psi: Array, split: bool, rng: np.random.Generator) -> tuple[Part, ...]:
