@@ -6,8 +6,6 @@ another value. Numbers of one method that nobody tunes stand where they are used
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 # Campaigns that are refused, and rows that are set aside.
@@ -31,7 +29,6 @@ NEAR_UNIT, ROUGHLY_UNIT = 0.15, 0.4  # sds of a log ratio from a factor of units
 HELD = 0.05  # relative scatter of a condition that was held constant; test_screening
 NOISIER = 2.0  # 1; scatter of the field over the lab's that is said; test_screening
 UNUSUAL_SIZE = 4.0  # sds from its prior at which a known size is questioned; test_case
-FOLLOWS_RUNS = 4.0  # nats gained by a line or step over the runs; test_ranking
 
 # How noise grows: with slip by 1 + rho s, with softness by (p_lab / p)^kappa; test_fit.
 RHO = np.array([0.0, 1.0, 2.5, 5.0])  # 1
@@ -84,44 +81,25 @@ NAMED = 0.5  # probability from which a hypothesis or cause is named; test_files
 FALSE_REGIONS = 0.1  # expected part of regions listed that are none, as is usual; test_mixture
 WORTH_SAYING = 0.05  # probability from which a caveat is given; test_files
 FOLDS = 5  # parts of the field rows left out in turn; test_files
-FOLD_DRAWS = 300  # effective draws there: they weigh predictions, not evidence; test_files
+FOLD_DRAWS = 300.0  # effective draws there: they weigh predictions, not evidence; test_files
 SHARE_ERROR = 0.35  # relative error of a cause's size among several; test_mixture
 SMALLEST_GAP = 0.5  # of the noise (rms); a smaller gap cannot shrink; test_corrected
 SURPRISE = 1.25  # 1; widens the lower end of a shrink to hold 90 % of blind cases; test_corrected
 ALIKE = 0.95  # cosine from which a design cannot tell two effects apart; test_ranking
-PLENTY = 1280  # effective draws; evidence within 0.04 nats (one sd); test_fit
 
 
-@dataclass(frozen=True)
-class SearchLimits:
-    """How far the search for explanations goes; nats of evidence times prior; test_ranking."""
-
-    pair_seeds: int = 4  # best single effects, of which one is in every pair
-    sets_changed: int = 2  # best sets of each number of causes that others are made from
-    most_causes: int = 4
-    near_best: float = 5.0  # nats; a set is changed if it is so near the best
-    fitted: int = 24  # new sets fitted in a round
-    fitted_again: int = 24  # known sets fitted again in a round: posteriors have many modes
-    again: float = 3.0  # nats; fitted again if a guess expects no more than this less
-    better: float = 1.0  # nats; changed again if it is found to be so much better
-    leading: int = 7  # single causes beside which something unlisted is tried
-    leading_sets: int = 3  # sets beside which it is tried
-    hopeless: float = 15.0  # nats behind after a truncated fit: given up
-    searched: float = 8.0  # nats; started from more guesses
-    behind: float = 6.5  # nats; a set made of another is given up
-    behind_resized: float = 10.0  # nats; with other priors, which need more steps
-    unpromising: float = 60.0  # nats; not fitted at all
-    unusually_large: float = 2.0  # prior sds from which an effect is tried with a wider prior
-    guesses: int = 64  # starting points of an effect that are compared
-    guesses_of_pair: int = 32  # the same for the second effect of a pair, from either side
-    started: int = 5  # starting points that a fit of one effect climbs from
-    stepped: int = 4  # of one more effect: guesses that the others take a step from
-    started_in_set: int = 2  # of which so many are climbed from
-    thresholds: int = 24  # thresholds tried for a discrepancy that sets in
-    in_play: float = 4.0  # nats; hypotheses whose posterior is drawn
-    variant_in_play: float = 2.5  # nats; variants of a hypothesis in play
-    relevance_behind: float = 7.0  # nats; beyond it relevance is estimated from few draws
-    relevance_far: float = 10.0  # nats; beyond it relevance is not estimated
-
-
-SEARCH = SearchLimits()
+# How sets of causes are screened, and posteriors drawn; test_screen, test_posterior.
+PRIOR_DRAWS = 1024  # of each cause
+PARTS = 8  # normals that stand for an effect's prior draws
+RANK = 8  # directions in which the rows of a part vary
+BEAM = 100  # choices of parts that are enlarged by one more cause; 300 changed nothing
+MOST_CAUSES = 4
+CUT = 10.0  # nats behind the best by the screen from which a hypothesis is given up; 15: no change
+BESIDE = 10  # best listed hypotheses beside which something unlisted is tried
+GUESSES = 3  # best choices of parts that a posterior's search begins from
+STEPS = 4  # regressions by which a guess is conditioned on the rows
+GUESS_SCALE = 1.5  # of a guess's sd, whose tails would be too light
+FIRST, FIRST_ROUNDS = 100.0, (1000,) * 4  # effective draws that a first look asks for; its rounds
+IN_PLAY = 6.0  # nats behind the best, by first looks that are up to two too low
+PLENTY = 1280.0  # effective draws; evidence within 0.04 nats (one sd)
+ROUNDS = (2000,) * 7 + (4000,)  # draws

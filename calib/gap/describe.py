@@ -35,8 +35,8 @@ from calib.gap.mixture import (
 )
 from calib.gap.noise import noise_conditions
 from calib.gap.odds import left_of, likelihood_tempering, probabilities
-from calib.gap.suggestions import suggestions
 from calib.gap.same_soil import shift_if_same_soil
+from calib.gap.suggestions import suggestions
 from calib.inference.priors import Prior
 from calib.inference.random import generator
 from calib.models import get_model

@@ -75,12 +75,9 @@ class Residuals:
             o.name: slice(a, b) for o, a, b in zip(data.outputs, starts, ends, strict=True)
         }
         self.field = np.concatenate(
-            [np.arange(p.stop - o.rows.size, p.stop) for o, p in self._outputs()]
+            [np.arange(b - o.rows.size, b) for o, b in zip(data.outputs, ends, strict=True)]
         )
         self.linear = forward.smooth
-
-    def _outputs(self) -> zip[tuple[object, slice]]:
-        return zip(self.data.outputs, self.parts.values(), strict=True)
 
     def raw(self, psi: Array) -> Array:
         """Evaluate, shape (k, d) to (k, N)."""

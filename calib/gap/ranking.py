@@ -11,7 +11,17 @@ from scipy.special import logsumexp
 from calib.errors import CalibError, meant
 from calib.gap.campaigns import Campaigns, OutputData
 from calib.gap.case import Context
-from calib.gap.constants import PLENTY
+from calib.gap.constants import (
+    BESIDE,
+    CUT,
+    FIRST,
+    FIRST_ROUNDS,
+    GUESSES,
+    IN_PLAY,
+    PARTS,
+    PLENTY,
+    ROUNDS,
+)
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.fit import Fit
 from calib.gap.hypotheses import (
@@ -37,7 +47,7 @@ from calib.gap.odds import (
     sizes,
 )
 from calib.gap.posterior import sample
-from calib.gap.screen import PARTS, Cause, Choice, Screen
+from calib.gap.screen import Cause, Choice, Screen
 from calib.inference.mode import find_mode
 from calib.inference.proposal import StudentT
 from calib.inference.random import generator
@@ -114,7 +124,7 @@ def rank(
     effects: Mapping[str, Effect] = EFFECTS,
     lab: Lab | None = None,
     design: Identifiability | None = None,
-    plenty: int = PLENTY,
+    plenty: float = PLENTY,
 ) -> Ranking:
     """Fit every hypothesis and rank them.
 
@@ -125,8 +135,8 @@ def rank(
         If `calibrate_lab` has been called before.
     design : Identifiability, optional
         What the design could show, if it is known from a campaign that has all of these rows.
-    plenty : int, optional
-        Effective draws of a posterior, and draws for its relevance, that are enough.
+    plenty : float, optional
+        Effective draws of a posterior that are enough.
     """
     able, unable = split_testable(data, with_case_effects(data, effects))
     lab_mode, noise = lab or calibrate_lab(data, seed)
@@ -154,14 +164,7 @@ def rank(
     return Ranking(fits, scores, log_evidence, probability, unable, lab_mode, design, odds, gap)
 
 
-# Nats behind the best at which the screen gives a hypothesis up: it was at most 6.3 wrong on 52 cases.
-CUT = 10.0
-# Nats behind the best at which a posterior is drawn until its draws are plenty.
-IN_PLAY = 6.0
-BESIDE = 10  # best listed hypotheses beside which something unlisted is tried
-GUESSES = 3  # best choices of parts that a search begins from
-FIRST, FIRST_ROUNDS = 100.0, (1000,) * 4  # effective draws that a first look asks for; its rounds
-ROUNDS = (2000,) * 7 + (4000,)
+# A part of each cause, by its place.
 type Chosen = tuple[tuple[Cause, int], ...]
 
 
@@ -271,52 +274,59 @@ def _check_names(context: Context, known: set[str]) -> None:
 
 
 def _scored(
-    screen: Screen, candidates: Sequence[Candidate], odds: Odds, seed: int, plenty: int
+    screen: Screen, candidates: Sequence[Candidate], odds: Odds, seed: int, plenty: float
 ) -> tuple[dict[str, tuple[Fit, ...]], dict[str, tuple[float, ...]]]:
     """Draw every candidate's posterior, and those in play until the draws are plenty."""
-    fits, scores, places = list[Fit](), list[float](), dict[str, list[int]]()
-    proposals = []
-
-    def keep(i: int, drawn: tuple[Fit, StudentT], rows: int) -> None:
-        fits[i], proposals[i] = drawn
-        c = candidates[i]
-        scores[i] = fits[i].log_evidence + float(np.log(c.hypothesis.share))
-        if c.choices[0][1]:  # unless nothing acts
-            size = sizes(fits[i].forward, screen.noise, fits[i].sample[::rows])
-            scores[i] += ln_relevant(size) - c.ln_relevant
-
-    def labelled(i: int, stage: str) -> np.random.Generator:
-        h = candidates[i].hypothesis
-        over = (h.smooth_over, h.onset_over or "", str(h.smooth), str(h.shift), h.shift_as)
-        return generator(seed, "gap", stage, h.name, *over, *h.smooth_outputs)
-
-    for i, c in enumerate(candidates):
-        forward = screen.forward(c.hypothesis)
-        top = sorted(c.choices, key=lambda choice: -choice[0])[:GUESSES]
-        guesses = [(screen.guess(forward, chosen), np.exp(v - top[0][0])) for v, chosen in top]
-        fits.append(None), proposals.append(None), scores.append(0.0)
-        keep(
-            i, sample(forward, screen.noise, guesses, labelled(i, "first"), FIRST, FIRST_ROUNDS), 5
-        )
-        places.setdefault(c.name, []).append(i)
+    found = [_first_look(screen, c, seed) for c in candidates]
+    ln_prior = np.array([odds.ln_prior(c.name) for c in candidates])
     done: set[int] = set()
     while True:
-        ln = np.array([s + odds.ln_prior(c.name) for s, c in zip(scores, candidates, strict=True)])
-        asked = sorted(set(np.flatnonzero(ln > ln.max() - IN_PLAY).tolist()) - done)
+        ln = np.array([score for _, _, score in found]) + ln_prior
+        asked = set(np.flatnonzero(ln > ln.max() - IN_PLAY).tolist()) - done
         if not asked:
             break
-        done |= set(asked)
-        for i in asked:
-            again = [(proposals[i], 1.0)]
-            keep(
-                i,
-                sample(fits[i].forward, fits[i].noise, again, labelled(i, "draws"), plenty, ROUNDS),
-                1,
+        done |= asked
+        for i in sorted(asked):
+            fit, proposal, _ = found[i]
+            again = sample(
+                fit.forward,
+                fit.noise,
+                [(proposal, 1.0)],
+                _stream(candidates[i].hypothesis, seed, "draws"),
+                plenty,
+                ROUNDS,
             )
-    return (
-        {name: tuple(fits[i] for i in at) for name, at in places.items()},
-        {name: tuple(scores[i] for i in at) for name, at in places.items()},
-    )
+            found[i] = (*again, _score(screen, candidates[i], again[0], 1))
+    fits: dict[str, tuple[Fit, ...]] = {}
+    scores: dict[str, tuple[float, ...]] = {}
+    for c, (fit, _, score) in zip(candidates, found, strict=True):
+        fits[c.name] = (*fits.get(c.name, ()), fit)
+        scores[c.name] = (*scores.get(c.name, ()), score)
+    return fits, scores
+
+
+def _first_look(screen: Screen, c: Candidate, seed: int) -> tuple[Fit, StudentT, float]:
+    """Draw a posterior from its best guesses."""
+    forward = screen.forward(c.hypothesis)
+    top = sorted(c.choices, key=lambda choice: -choice[0])[:GUESSES]
+    guesses = [(screen.guess(forward, chosen), float(np.exp(v - top[0][0]))) for v, chosen in top]
+    rng = _stream(c.hypothesis, seed, "first")
+    fit, proposal = sample(forward, screen.noise, guesses, rng, FIRST, FIRST_ROUNDS)
+    return fit, proposal, _score(screen, c, fit, 5)
+
+
+def _score(screen: Screen, c: Candidate, fit: Fit, every: int) -> float:
+    """Log evidence of the relevant prior, by every so manieth draw, times the share in its name."""
+    score = fit.log_evidence + float(np.log(c.hypothesis.share))
+    if not c.choices[0][1]:  # nothing acts
+        return score
+    size = sizes(fit.forward, screen.noise, fit.sample[::every])
+    return score + ln_relevant(size) - c.ln_relevant
+
+
+def _stream(h: Hypothesis, seed: int, stage: str) -> np.random.Generator:
+    over = (h.smooth_over, h.onset_over or "", str(h.smooth), str(h.shift), h.shift_as)
+    return generator(seed, "gap", stage, h.name, *over, *h.smooth_outputs)
 
 
 def calibrate_lab(data: Campaigns, seed: int) -> Lab:

@@ -3,10 +3,10 @@
 What a cause does to the field rows is drawn from its prior, at the simulator as the laboratory
 calibrated it. The draws are split into parts of similar shape and size, each of them a normal; the
 simulator is linear about its calibration, and causes add up. A choice of one part for each cause of
-a set is then one multivariate normal of the field rows, whose noise is known as well as the
-laboratory knows it. A set's evidence is the sum over its choices. Conditioning the draws' parameters
-on the rows, as normal too, gives the first guess at the posterior (an ensemble Kalman update;
-Evensen 2003, doi:10.1007/s10236-003-0036-9).
+a set is then one multivariate normal of the field rows, with a noise that is as uncertain as the
+laboratory leaves it. A set's evidence is the sum over its choices. The parameters of the draws,
+conditioned on the rows as if they were normal too, are the first guess at the posterior (an
+iterated ensemble Kalman update; Iglesias, Law & Stuart 2013, doi:10.1088/0266-5611/29/4/045001).
 """
 
 from __future__ import annotations
@@ -15,11 +15,22 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 from scipy.linalg import block_diag
 
 from calib.gap.campaigns import Campaigns
-from calib.gap.constants import MIN_EFFECT_SIZE, MIN_EFFECT_SIZE_IN_PAIR
+from calib.gap.constants import (
+    BEAM,
+    GUESS_SCALE,
+    MIN_EFFECT_SIZE,
+    MIN_EFFECT_SIZE_IN_PAIR,
+    MOST_CAUSES,
+    PARTS,
+    PRIOR_DRAWS,
+    RANK,
+    STEPS,
+)
 from calib.gap.fit import Residuals
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import Hypothesis
@@ -30,14 +41,6 @@ from calib.inference.mode import prior_widths
 from calib.inference.proposal import StudentT
 from calib.inference.random import generator
 from calib.models.base import Array
-
-DRAWS = 1024  # of the prior of each cause
-PARTS = 8  # of an effect
-RANK = 8  # directions of a part in which an effect's rows vary
-BEAM = 100  # choices of parts that are enlarged by one more cause
-MOST_CAUSES = 4
-STEPS = 4
-WIDER = 1.5
 
 
 @dataclass(frozen=True)
@@ -140,7 +143,7 @@ class Screen:
         forward = self.forward(hypothesis)
         label = (hypothesis.name, hypothesis.smooth_over, hypothesis.onset_over or "")
         rng = generator(self.seed, "gap", "screen", *label, *hypothesis.smooth_outputs)
-        psi = forward.prior_draws(rng, DRAWS)
+        psi = forward.prior_draws(rng, PRIOR_DRAWS)
         psi[:, : forward.n_shared] = self.start
         full, plain = forward.field_and_plain(psi, self.data.view)
         does = self._problem.of_field({o: full[o] - plain[o] for o in full}) / self._field_sds
@@ -208,34 +211,31 @@ class Screen:
         )
         mean, found = mean[u], found[np.ix_(u, u)]
         return StudentT(
-            mean, WIDER * np.linalg.cholesky(found + 1e-12 * np.diag(np.diag(found))), DOF
+            mean, GUESS_SCALE * np.linalg.cholesky(found + 1e-12 * np.diag(np.diag(found))), DOF
         )
 
     def _conditioned(self, forward: Forward, mean: Array, covariance: Array) -> tuple[Array, Array]:
-        """Condition on all rows by regressions of the rows on draws of the guess."""
-        problem = Residuals(self.data, forward)
-        sds, rng = (
-            problem.sds(self.noise),
-            generator(self.seed, "gap", "guess", forward.hypothesis.name),
-        )
-        loc, scale, lower, upper, precision = forward.priors._arrays
+        """Condition a guess at psi on all rows, by regressions of these on draws of the guess."""
+        problem, d = Residuals(self.data, forward), forward.n_dim
+        rng = generator(self.seed, "gap", "guess", forward.hypothesis.name)
+        loc, _, lower, upper, precision = forward.priors._arrays
         loc = np.where(precision > 0.0, loc, 0.0)
         for _ in range(STEPS):
-            root = np.linalg.cholesky(covariance + 1e-10 * np.diag(np.diag(covariance) + 1e-12))
-            psi = np.clip(
-                mean + rng.standard_normal((12 * mean.size, mean.size)) @ root.T, lower, upper
-            )
-            raw = problem.raw(psi) / sds
+            root = np.linalg.cholesky(covariance + 1e-10 * np.diag(np.diag(covariance)))
+            psi = mean + rng.standard_normal((12 * d, d)) @ root.T
+            psi = np.clip(psi, lower, upper)
+            raw = problem.raw(psi) / problem.sds(self.noise)
             known = np.isfinite(raw).all(axis=1)
-            if known.sum() < 3 * mean.size:
+            if known.sum() < 3 * d:
                 break
             raw, psi = np.clip(raw[known], -1e3, 1e3), psi[known]
-            centre, left = psi.mean(axis=0), raw.mean(axis=0)
-            away = psi - centre
-            width = away.std(axis=0) + 1e-300
-            slope = np.linalg.lstsq(away / width, raw - left, rcond=1e-8)[0] / width[:, None]
+            centre, left, width = psi.mean(axis=0), raw.mean(axis=0), psi.std(axis=0) + 1e-300
+            away = (psi - centre) / width
+            slope = np.linalg.lstsq(away, raw - left, rcond=1e-8)[0]
+            # What is not linear about the rows counts as noise.
             noise = 1.0 + np.square(raw - left - away @ slope).mean(axis=0)
-            inner = np.diag(precision**2) + (slope / noise) @ slope.T + np.diag(1e-6 / width**2)
+            slope /= width[:, None]
+            inner = (slope / noise) @ slope.T + np.diag(precision**2 + 1e-6 / width**2)
             covariance = np.linalg.inv(inner)
             pull = precision**2 * (loc - centre) - (slope / noise) @ left
             mean = np.clip(centre + covariance @ pull, lower, upper)
@@ -316,7 +316,7 @@ class _Beam:
         self._inner = np.eye(RANK) + roots @ roots.swapaxes(1, 2)
         self._to_mean = (roots @ means[..., None])[..., 0]
 
-    def _enlarge(self, parts: Sequence[int], allowed: Array) -> Array:
+    def _enlarge(self, parts: Sequence[int], allowed: NDArray[np.intp]) -> Array:
         """Log evidence of a choice with each of the allowed parts more."""
         gram, means, directions = self._gram, self._means[allowed], self._directions[allowed]
         chosen = self._means[list(parts)]
@@ -337,30 +337,25 @@ class _Beam:
         root = np.linalg.cholesky(inner)
         squares -= np.square(np.linalg.solve(root, to_left[..., None])[..., 0]).sum(axis=1)
         ln_dets = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
-        return self._screen.ln_tail(squares) - np.log(np.diag(lower)).sum() - ln_dets
+        return np.asarray(self._screen.ln_tail(squares) - np.log(np.diag(lower)).sum() - ln_dets)
 
     def run(self, most: int) -> list[Choice]:
         """Evaluate choices of up to so many causes."""
-        every, found = np.arange(len(self._labels)), []
+        found: list[Choice] = []
         level: dict[tuple[int, ...], float] = {(): 0.0}
         for size in range(most):
             if size >= 2:
-                best = sorted(level, key=lambda parts: -level[parts])[:BEAM]
-                level = {parts: level[parts] for parts in best}
+                level = dict(sorted(level.items(), key=lambda item: -item[1])[:BEAM])
             larger: dict[tuple[int, ...], float] = {}
             for parts in level:
                 # Every pair once; larger sets from whichever of their parts is in the beam.
-                last = self._of[parts[-1]] if size == 1 else -1
-                chosen = self._of[list(parts)] if parts else []
-                allowed = every[(self._of > last) & ~np.isin(self._of, chosen)]
-                if not allowed.size:
-                    continue
-                share = self._ln_share[list(parts)].sum() + self._ln_share[allowed]
-                value = self._enlarge(parts, allowed) + share
-                larger |= {
-                    tuple(sorted((*parts, p))): v
-                    for p, v in zip(allowed.tolist(), value.tolist(), strict=True)
-                }
+                later = self._of > self._of[parts[-1]] if size == 1 else True
+                allowed = np.flatnonzero(later & ~np.isin(self._of, self._of[list(parts)]))
+                if allowed.size:
+                    share = self._ln_share[list(parts)].sum() + self._ln_share[allowed]
+                    values = (self._enlarge(parts, allowed) + share).tolist()
+                    for part, value in zip(allowed.tolist(), values, strict=True):
+                        larger[tuple(sorted((*parts, part)))] = value
             level = larger
             found += [Choice(tuple(self._labels[p] for p in c), v) for c, v in level.items()]
         return found
