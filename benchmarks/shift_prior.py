@@ -23,12 +23,13 @@ from calib.batch.environment import one_thread
 from calib.batch.tasks import completed
 from calib.gap.campaigns import OutputData, campaigns
 from calib.gap.case import read_case
-from calib.gap.constants import SHIFTS
+from calib.gap.constants import PLENTY, ROUNDS, SHIFTS
 from calib.gap.discrepancy import alone_sd, coordinates
-from calib.gap.fit import Fit, fit
-from calib.gap.forward import Forward
+from calib.gap.fit import Fit
 from calib.gap.hypotheses import Hypothesis
+from calib.gap.posterior import sample
 from calib.gap.ranking import calibrate_lab
+from calib.gap.screen import Screen
 from challenge.design import Tier
 from challenge.make import make_case
 
@@ -58,16 +59,13 @@ def see(seed: np.random.SeedSequence, tier: Tier) -> Seen | None:
     with tempfile.TemporaryDirectory() as folder, one_thread():
         make_case(seed, tier, "parameter_shift").write(Path(folder))
         data = campaigns(read_case(Path(folder)))
-        lab_mode, noise = calibrate_lab(data, 0)
-        fits = []
+        screen, fits = Screen(data, *calibrate_lab(data, 0), 0), []
         for size in SHIFTS:
             hypothesis = Hypothesis("parameter_shift", shift=size)
-            sigma = {o: n.sigma for o, n in noise.items()}
-            forward = Forward(data, hypothesis, sigma, lab_mode)
-            start = np.array([p.loc for p in forward.priors.free])
-            for o in data.outputs:
-                start[forward.theta_slices[o.name]] = lab_mode[o.name]
-            fits.append(fit(forward, start, noise))
+            forward, cause = screen.forward(hypothesis), screen.cause(hypothesis)
+            guess, noise = screen.guess(forward, [(cause, 0)])
+            rng = np.random.default_rng(0)
+            fits.append(sample(forward, noise, [(guess, 1.0)], rng, PLENTY, ROUNDS)[0])
     best = max(fits, key=lambda f: f.log_evidence)
     return seen(best, data.outputs)
 

@@ -207,11 +207,14 @@ def screened_ranking(
     data, lab, said = screen(case, seed)
     ranking = rank(data, seed, effects=effects, lab=lab)
     for _ in range(MOST_ROUNDS):
-        kept, more = without_field_outliers(data, ranking)
+        kept, more, sure = without_field_outliers(data, ranking)
         if not more:
             break
-        data, said = kept, said + more
-        ranking = rank(data, seed, effects=effects, lab=lab)
+        without = rank(kept, seed, effects=effects, lab=lab)
+        # A reading that takes a cause of its own to explain is an outlier as well.
+        if not sure and without.causes >= ranking.causes:
+            break
+        data, ranking, said = kept, without, said + more
     return data, ranking, said + left_over(data, ranking)
 
 

@@ -263,15 +263,27 @@ class Forward:
             if e.name not in known and priors.free
         ]
 
+    def _ln_odds_wide(self, psi: Array) -> list[Array]:
+        """Log odds that each size is of its wide prior, shape (k,); 0 outside bounds."""
+        odds = np.log(WIDE) - np.log1p(-WIDE)
+        found = []
+        for part, usual, wide in self._sizes:
+            ln_usual, ln_wide = (p.log_prob(psi[:, part]) for p in (usual, wide))
+            inside = np.isfinite(ln_usual)
+            found.append(odds + np.where(inside, ln_wide, 0.0) - np.where(inside, ln_usual, 0.0))
+        return found
+
     def log_prior(self, psi: Array) -> Array:
         """Log prior density, shape (k,): of sizes a mixture of the usual priors and wide ones."""
         value = self.priors.log_prob(psi)
-        inside = np.isfinite(value)
-        for part, usual, wide in self._sizes:
-            t = psi[inside, part]
-            denser = wide.log_prob(t) - usual.log_prob(t)
-            value[inside] += np.logaddexp(np.log1p(-WIDE), np.log(WIDE) + denser)
+        for ln_odds in self._ln_odds_wide(psi):
+            value += np.log1p(-WIDE) + np.logaddexp(0.0, ln_odds)
         return value
+
+    def ln_usual(self, psi: Array) -> Array:
+        """Log probability that all sizes are of their usual priors, shape (k,)."""
+        found = [-np.logaddexp(0.0, ln_odds) for ln_odds in self._ln_odds_wide(psi)]
+        return np.sum(found, axis=0) if found else np.zeros(len(psi))
 
     def prior_draws(self, rng: np.random.Generator, size: int) -> Array:
         """Draw from the prior by a Latin hypercube, shape (size, d)."""

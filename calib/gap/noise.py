@@ -127,19 +127,6 @@ def ln_averaged(squared: Array, at: NoiseConditions) -> Array:
     return np.asarray(log_sum(value.T) + constant)
 
 
-def ln_averaging(raw: Array, left: Array, at: NoiseConditions) -> Array:
-    """Log of the factor by which averaging over the noise raises a fit's evidence, shape (m,).
-
-    Laplace's method over ln sigma: of n residuals of which parameters took up p, its sd is
-    (2 (n - p))^(-1/2), and the rest is as in `ln_averaged`.
-    """
-    value, _ = _profile(np.square(raw) / left, at)
-    known = np.isfinite(value).all(axis=1)
-    value = np.where(known[:, None], value, 0.0)
-    lifted = log_sum(value.T) - value.max(axis=1) - 0.5 * np.log(left.mean(axis=1))
-    return np.where(known, lifted, 0.0)
-
-
 def _profile(squared: Array, at: NoiseConditions) -> tuple[Array, Array]:
     """Log of likelihood times prior at the best sigma of every rho and kappa, and its square.
 

@@ -1,12 +1,12 @@
 """Draw the posterior of a hypothesis and estimate its evidence, by adaptive importance sampling.
 
 What is linear is not searched. With psi = (u, c, a), the coefficients a of a free discrepancy are
-normal given the rest and integrated out; the form errors c are drawn from the normal q(c | u) that
-they have where effects add up, and u is weighted with p(u, c, y) / q(c | u), an unbiased estimate of
-p(u, y) (Fearnhead, Papaspiliopoulos & Roberts 2008, doi:10.1111/j.1467-9868.2008.00661.x). Draws of
-u of all rounds count, weighted as from the mixture of their proposals (Cornuet et al. 2012,
-doi:10.1111/j.1467-9469.2011.00756.x) and truncated (Ionides 2008, doi:10.1198/106186008X320456).
-The mean weight is the evidence.
+normal given the rest and integrated out. The form errors c are drawn from the normal q(c | u) that
+they have where effects add up, and u is weighted with p(u, c, y) / q(c | u), an unbiased estimate
+of p(u, y) (Fearnhead, Papaspiliopoulos & Roberts 2008, doi:10.1111/j.1467-9868.2008.00661.x).
+Draws of u of all rounds count, weighted as from the mixture of their proposals (Cornuet et al.
+2012, doi:10.1111/j.1467-9469.2011.00756.x); large weights are truncated (Ionides 2008,
+doi:10.1198/106186008X320456). The mean weight is the evidence.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ _LN_2_PI = float(np.log(2.0 * np.pi))
 # Degrees of freedom of proposals, and the sd of form errors' over the normal's: longer tails.
 DOF, _LONGER = 6.0, 1.1
 _DRAWS = 1500  # of a posterior that are kept
+# Of what is searched, and its weight among several.
+type Proposed = tuple[StudentT, float]
 
 
 def searched(forward: Forward) -> NDArray[np.int64]:
@@ -211,11 +213,11 @@ class Density:
 def sample(
     forward: Forward,
     noise: Mapping[str, Noise],
-    guesses: Sequence[tuple[StudentT, float]],
+    guesses: Sequence[Proposed],
     rng: np.random.Generator,
     effective: float,
     rounds: Sequence[int],
-) -> tuple[Fit, StudentT]:
+) -> tuple[Fit, list[Proposed]]:
     """Draw a posterior.
 
     Parameters
@@ -232,8 +234,8 @@ def sample(
     Returns
     -------
     Fit
-    StudentT
-        A proposal that fits the posterior.
+    list of (StudentT, float)
+        Proposals that fit the posterior.
     """
     density, proposals = Density(forward, noise), list(guesses)
     whole = sum(weight for _, weight in proposals)
@@ -247,10 +249,10 @@ def sample(
             break
         share = np.exp(log_weight - total)
         reached = 1.0 / float(np.square(share).sum())
-        moved = tempered_moments(pool.draws, log_weight)
-        if moved is None:
+        moved = _moved(forward, pool, log_weight, share)
+        if not moved:
             break
-        proposals, whole = [(StudentT(*moved, DOF), 1.0)], 1.0
+        proposals, whole = moved, sum(weight for _, weight in moved)
         if reached >= effective:
             break
     if not np.isfinite(total):  # nowhere has the model a value
@@ -269,7 +271,21 @@ def sample(
     ends = np.cumsum([o.rows.size for o in forward.data.outputs])[:-1]
     left = dict(zip(forward.data.names, np.split(standardised, ends), strict=True))
     fit = Fit(forward, found, total + _ln_mean(ln_factor), left, psi, reached)
-    return fit, proposals[0][0]
+    return fit, proposals
+
+
+def _moved(forward: Forward, pool: _Pool, log_weight: Array, share: Array) -> list[Proposed]:
+    """Fit proposals to what was drawn: one where sizes are usual, another where one is wide."""
+    ln_usual = forward.ln_usual(pool.psi)
+    usual = float(share @ np.exp(ln_usual))
+    with np.errstate(divide="ignore"):
+        ln_wide = np.log(-np.expm1(ln_usual))
+    found = []
+    for ln, weight in ((ln_usual, usual), (ln_wide, 1.0 - usual)):
+        moments = tempered_moments(pool.draws, log_weight + ln)
+        if moments is not None:
+            found.append((StudentT(*moments, DOF), max(weight, 0.2)))
+    return found
 
 
 def _ln_mean(ln: Array) -> float:

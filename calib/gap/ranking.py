@@ -46,10 +46,9 @@ from calib.gap.odds import (
     probabilities,
     sizes,
 )
-from calib.gap.posterior import sample
+from calib.gap.posterior import Proposed, sample
 from calib.gap.screen import Cause, Choice, Screen
 from calib.inference.mode import find_mode
-from calib.inference.proposal import StudentT
 from calib.inference.random import generator
 from calib.inference.search import check_defined
 from calib.models.base import Array
@@ -97,6 +96,11 @@ class Ranking:
     def order(self) -> list[str]:
         """Names, most probable first."""
         return sorted(self.probability, key=lambda name: -self.probability[name])
+
+    @property
+    def causes(self) -> int:
+        """How many causes the most probable hypothesis has."""
+        return 0 if self.order[0] == "none" else 1 + self.order[0].count("+")
 
     @property
     def prior(self) -> dict[str, float]:
@@ -287,11 +291,11 @@ def _scored(
             break
         done |= asked
         for i in sorted(asked):
-            fit, proposal, _ = found[i]
+            fit, proposals, _ = found[i]
             again = sample(
                 fit.forward,
                 fit.noise,
-                [(proposal, 1.0)],
+                proposals,
                 _stream(candidates[i].hypothesis, seed, "draws"),
                 plenty,
                 ROUNDS,
@@ -305,14 +309,18 @@ def _scored(
     return fits, scores
 
 
-def _first_look(screen: Screen, c: Candidate, seed: int) -> tuple[Fit, StudentT, float]:
+def _first_look(screen: Screen, c: Candidate, seed: int) -> tuple[Fit, list[Proposed], float]:
     """Draw a posterior from its best guesses."""
     forward = screen.forward(c.hypothesis)
     top = sorted(c.choices, key=lambda choice: -choice[0])[:GUESSES]
-    guesses = [(screen.guess(forward, chosen), float(np.exp(v - top[0][0]))) for v, chosen in top]
+    found = [screen.guess(forward, chosen) for _, chosen in top]
+    guesses = [
+        (proposal, float(np.exp(value - top[0][0])))
+        for (proposal, _), (value, _) in zip(found, top, strict=True)
+    ]
     rng = _stream(c.hypothesis, seed, "first")
-    fit, proposal = sample(forward, screen.noise, guesses, rng, FIRST, FIRST_ROUNDS)
-    return fit, proposal, _score(screen, c, fit, 5)
+    fit, proposals = sample(forward, found[0][1], guesses, rng, FIRST, FIRST_ROUNDS)
+    return fit, proposals, _score(screen, c, fit, 5)
 
 
 def _score(screen: Screen, c: Candidate, fit: Fit, every: int) -> float:

@@ -108,8 +108,9 @@ class Screen:
         problem = Residuals(data, none)
         sds, field = problem.sds(noise), problem.field
         lab = np.setdiff1d(np.arange(sds.size), field)
-        loc, _, lower, upper, precision = none.priors._arrays
-        mode = np.where(np.isfinite(loc), loc, 0.0)
+        *_, lower, upper, _ = none.priors._arrays
+        loc, precision = _as_normal(none)
+        mode = loc.copy()
         for name, t in lab_mode.items():
             mode[none.theta_slices[name]] = t
         step = 1e-4 * prior_widths(none.priors)
@@ -117,8 +118,7 @@ class Screen:
         raw = problem.raw(np.concatenate([mode[None], mode + np.diag(step)])) / sds
         slope = np.nan_to_num((raw[0] - raw[1:]) / step[:, None])
         self._precision = slope[:, lab] @ slope[:, lab].T + np.diag(precision**2)
-        self._precision += np.diag(1e-6 / prior_widths(none.priors) ** 2)
-        pull = slope[:, lab] @ raw[0, lab] + precision**2 * (np.where(precision, loc, 0.0) - mode)
+        pull = slope[:, lab] @ raw[0, lab] + precision**2 * (loc - mode)
         moved = np.linalg.solve(self._precision, pull)
         self.shared, self.start = np.clip(mode + moved, lower, upper), mode
         self._slope, self._field_sds, self._lower = slope[:, field], sds[field], lower
@@ -155,9 +155,10 @@ class Screen:
             return float(np.log((large.sum() + 0.5) / (known.sum() + 1.0)))
 
         parts: tuple[Part, ...] = ()
-        if relevant.sum() > RANK:
-            white = does[relevant] @ self._whitening.T
-            parts = _parts(white, psi[relevant, forward.n_shared :], bool(hypothesis.effects), rng)
+        some = relevant if relevant.sum() > 2 * RANK else known  # a size that is known may be small
+        if some.sum() > 2 * RANK:
+            white = does[some] @ self._whitening.T
+            parts = _parts(white, psi[some, forward.n_shared :], bool(hypothesis.effects), rng)
         return Cause(
             forward, parts, ln_share(known & (size >= MIN_EFFECT_SIZE)), ln_share(relevant)
         )
@@ -187,8 +188,18 @@ class Screen:
         """
         return _Beam(self, causes).run(most) if any(c.parts for c in causes.values()) else []
 
-    def guess(self, forward: Forward, chosen: Sequence[tuple[Cause, int]]) -> StudentT:
-        """Condition what is searched of a hypothesis on the rows, given a part of each cause."""
+    def guess(
+        self, forward: Forward, chosen: Sequence[tuple[Cause, int]]
+    ) -> tuple[StudentT, dict[str, Noise]]:
+        """Condition what is searched of a hypothesis on the rows, given a part of each cause.
+
+        Returns
+        -------
+        StudentT
+            A proposal.
+        dict of str to Noise
+            The most probable one there.
+        """
         parts = [c.parts[i] for c, i in chosen]
         design = np.concatenate([self._slope.T, *(self._unwhite @ p.root for p in parts)], axis=1)
         left = self._left - self._unwhite @ sum((p.mean for p in parts), np.zeros(len(design)))
@@ -206,25 +217,27 @@ class Screen:
             maps[ours, at], mean[ours] = part.slope[theirs - d], part.psi[theirs - d]
             spread[np.ix_(ours, ours)] = part.spread[np.ix_(theirs - d, theirs - d)]
         u = searched(forward)
-        mean, found = self._conditioned(
+        mean, found, noise = self._conditioned(
             forward, np.clip(mean + maps @ there, lower, upper), maps @ covariance @ maps.T + spread
         )
         mean, found = mean[u], found[np.ix_(u, u)]
-        return StudentT(
-            mean, GUESS_SCALE * np.linalg.cholesky(found + 1e-12 * np.diag(np.diag(found))), DOF
-        )
+        return StudentT(mean, GUESS_SCALE * _root(found), DOF), noise
 
-    def _conditioned(self, forward: Forward, mean: Array, covariance: Array) -> tuple[Array, Array]:
+    def _conditioned(
+        self, forward: Forward, mean: Array, covariance: Array
+    ) -> tuple[Array, Array, dict[str, Noise]]:
         """Condition a guess at psi on all rows, by regressions of these on draws of the guess."""
         problem, d = Residuals(self.data, forward), forward.n_dim
         rng = generator(self.seed, "gap", "guess", forward.hypothesis.name)
-        loc, _, lower, upper, precision = forward.priors._arrays
-        loc = np.where(precision > 0.0, loc, 0.0)
+        *_, lower, upper, _ = forward.priors._arrays
+        loc, precision = _as_normal(forward)
+        noise = dict(self.noise)
         for _ in range(STEPS):
-            root = np.linalg.cholesky(covariance + 1e-10 * np.diag(np.diag(covariance)))
+            root = _root(covariance)
             psi = mean + rng.standard_normal((12 * d, d)) @ root.T
             psi = np.clip(psi, lower, upper)
-            raw = problem.raw(psi) / problem.sds(self.noise)
+            sds = problem.sds(noise)
+            raw = problem.raw(psi) / sds
             known = np.isfinite(raw).all(axis=1)
             if known.sum() < 3 * d:
                 break
@@ -233,13 +246,33 @@ class Screen:
             away = (psi - centre) / width
             slope = np.linalg.lstsq(away, raw - left, rcond=1e-8)[0]
             # What is not linear about the rows counts as noise.
-            noise = 1.0 + np.square(raw - left - away @ slope).mean(axis=0)
+            variance = 1.0 + np.square(raw - left - away @ slope).mean(axis=0)
             slope /= width[:, None]
-            inner = (slope / noise) @ slope.T + np.diag(precision**2 + 1e-6 / width**2)
-            covariance = np.linalg.inv(inner)
-            pull = precision**2 * (loc - centre) - (slope / noise) @ left
+            per_sd = slope / precision[:, None]  # of the prior: well conditioned
+            inner = np.eye(d) + (per_sd / variance) @ per_sd.T
+            covariance = np.linalg.inv(inner) / np.outer(precision, precision)
+            pull = precision**2 * (loc - centre) - (slope / variance) @ left
             mean = np.clip(centre + covariance @ pull, lower, upper)
-        return mean, covariance
+            squared = np.square(left + (mean - centre) @ slope)
+            squared += (slope * (covariance @ slope)).sum(axis=0)
+            noise = problem.noise_of(squared * sds**2)
+        return mean, covariance, noise
+
+
+def _root(covariance: Array) -> Array:
+    """Cholesky factor of a covariance that may be flat in some direction."""
+    sd = np.sqrt(np.diag(covariance)) + 1e-300
+    alike = covariance / np.outer(sd, sd)
+    return sd[:, None] * np.linalg.cholesky(0.5 * (alike + alike.T) + 1e-8 * np.eye(sd.size))
+
+
+def _as_normal(forward: Forward) -> tuple[Array, Array]:
+    """Means and inverse sds of the priors, uniform ones as normal as well."""
+    loc, _, lower, upper, precision = forward.priors._arrays
+    normal = precision > 0.0
+    with np.errstate(invalid="ignore"):
+        middle, width = 0.5 * (lower + upper), np.sqrt(12.0) / (upper - lower)
+    return np.where(normal, loc, middle), np.where(normal, precision, width)
 
 
 def _parts(white: Array, psi: Array, split: bool, rng: np.random.Generator) -> tuple[Part, ...]:

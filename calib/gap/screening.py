@@ -24,6 +24,7 @@ from calib.gap.constants import (
     LEFT_OVER,
     MOST_ROUNDS,
 )
+from calib.gap.fit import Fit
 from calib.gap.ranking import Lab, Ranking, calibrate_lab
 from calib.models import get_model
 from calib.models.base import Array
@@ -133,13 +134,25 @@ def screen(case: Case, seed: int) -> tuple[Campaigns, Lab, list[str]]:
     return data, lab, said + outlying
 
 
-def without_field_outliers(data: Campaigns, ranking: Ranking) -> tuple[Campaigns, list[str]]:
-    """Set field rows aside that no hypothesis explains, however good it is for the others."""
-    far = _field_outliers(data, ranking)
+def without_field_outliers(data: Campaigns, ranking: Ranking) -> tuple[Campaigns, list[str], bool]:
+    """Set field rows aside that lie far from an explanation, however good it is for the others.
+
+    Returns
+    -------
+    Campaigns
+    list of str
+        What was set aside.
+    bool
+        Whether the most probable explanation leaves it, not only all of one cause: a set may bend
+        to a reading.
+    """
+    sure = _field_outliers(data, [ranking.best(ranking.order[0])])
+    one = [ranking.best(name) for name in ranking.order if "+" not in name and name != "unknown"]
+    far = sure or _field_outliers(data, one)
     if not far:
-        return data, []
+        return data, [], False
     said = _said(data.case.field, far, _outlying(FIELD_OUTLIER))
-    return campaigns(without_outputs(data.case, far)), said
+    return campaigns(without_outputs(data.case, far)), said, bool(sure)
 
 
 def left_over(data: Campaigns, ranking: Ranking) -> list[str]:
@@ -214,11 +227,12 @@ def _said(table: Table, far: Mapping[str, list[int]], why: str) -> list[str]:
     return said
 
 
-def _field_outliers(data: Campaigns, ranking: Ranking) -> dict[str, list[int]]:
-    best = ranking.best(ranking.order[0])
+def _field_outliers(data: Campaigns, fits: Sequence[Fit]) -> dict[str, list[int]]:
+    """Rows of each output that are far from all of some explanations."""
     far = {}
     for o in data.outputs:
-        found = np.abs(best.field_residuals[o.name]) > FIELD_OUTLIER
+        least = np.min([np.abs(f.field_residuals[o.name]) for f in fits], axis=0)
+        found = least > FIELD_OUTLIER
         if 0 < found.sum() <= _most(o.rows.size):
             far[o.name] = [int(row) for row in o.rows[found]]
     return far

@@ -92,20 +92,21 @@ def suggest(
     # A step may be anywhere; beforehand nothing is as probable as all terms together.
     evidence = [logsumexp(each) - np.log(each.size * len(terms)) for each in ln]
     nothing, *p = softmax([0.0, *evidence]).tolist()
-    # Of terms that look the same on these rows the most probable stands for all.
-    apart: dict[int, Array] = {}
+    looks = [_without(base, x[each.argmax()]) for (*_, x), each in zip(terms, ln, strict=True)]
+    looks = [x / max(float(np.linalg.norm(x)), 1e-300) for x in looks]
+    # Of terms that look the same on these rows the simplest stands for all: it is listed first.
+    alike: dict[int, list[int]] = {}
     for i in sorted(range(len(p)), key=lambda i: -p[i]):
-        x = _without(base, terms[i][-1][ln[i].argmax()])
-        x /= max(float(np.linalg.norm(x)), 1e-300)
-        same = next((j for j, other in apart.items() if abs(other @ x) >= ALIKE), i)
-        p[same] += p[i] * (same != i)
-        apart.setdefault(same, x)
+        same = next((j for j in alike if abs(looks[j] @ looks[i]) >= ALIKE), i)
+        alike.setdefault(same, []).append(i)
     found = []
-    for i in sorted(apart, key=lambda i: -p[i]):
+    for group in alike.values():
+        i, together = min(group), sum(p[j] for j in group)
         kind, columns, at, factor, x = terms[i]
-        if p[i] >= max(nothing, WORTH_SAYING) and (removed := _removed(y, base, x)) > 0.0:
-            place, up = float(at[ln[i].argmax()]), bool(apart[i] @ y > 0.0)
-            found.append(Suggestion(output, kind, columns, place, factor, up, p[i], removed))
+        if together >= max(nothing, WORTH_SAYING) and (removed := _removed(y, base, x)) > 0.0:
+            place, up = float(at[ln[i].argmax()]), bool(looks[i] @ y > 0.0)
+            found.append(Suggestion(output, kind, columns, place, factor, up, together, removed))
+    found.sort(key=lambda s: -s.probability)
     return found[:3]
 
 

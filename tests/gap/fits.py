@@ -7,11 +7,14 @@ from dataclasses import replace
 import numpy as np
 
 from calib.gap.campaigns import Campaigns, OutputData, campaigns
-from calib.gap.fit import Fit
+from calib.gap.constants import PLENTY, ROUNDS
+from calib.gap.fit import Fit, Residuals
 from calib.gap.forward import Forward
-from calib.gap.gauss_newton import Residuals, variance_left
 from calib.gap.hypotheses import Hypothesis
-from calib.gap.noise import Noise, ln_averaging, noise_conditions_of_lab
+from calib.gap.noise import Noise, noise_conditions_of_lab
+from calib.gap.posterior import sample
+from calib.gap.ranking import calibrate_lab
+from calib.gap.screen import Screen
 from calib.inference.priors import Prior, Priors
 from tests.custom_problems import normal, problem_of
 from tests.gap.cases import NOISE, PULL_ONLY, make_case
@@ -24,7 +27,36 @@ def fit_at(data: Campaigns, hypothesis: Hypothesis, sd: float = 0.0) -> Fit:
     forward = Forward(data, hypothesis, SIGMA)
     psi = np.array([p.loc for p in forward.priors.free])
     noise = {o.name: Noise(SIGMA[o.name]) for o in data.outputs}
-    return Fit(forward, psi, sd**2 * np.eye(psi.size), noise, 0.0, 0.0, {})
+    return Fit(forward, noise, 0.0, {}, draws_of(psi, sd * np.eye(psi.size)))
+
+
+def draws_of(psi: np.ndarray, root: np.ndarray) -> np.ndarray:
+    """Return draws of exactly this mean and root of the covariance."""
+    away = np.sqrt(psi.size) * root.T
+    return np.concatenate([psi + away, psi - away])
+
+
+def moved(found: Fit, psi: np.ndarray) -> Fit:
+    """Return a posterior elsewhere."""
+    return replace(found, sample=found.sample + (psi - found.psi))
+
+
+def fitted(
+    data: Campaigns, hypothesis: Hypothesis, effective: float = PLENTY, seed: int = 1
+) -> Fit:
+    """Return a posterior from the guesses of the screen."""
+    screen = Screen(data, *calibrate_lab(data, seed), seed)
+    forward = screen.forward(hypothesis)
+    choices = [[]]
+    if forward.causes:
+        cause = screen.cause(hypothesis)
+        choices = [[(cause, i)] for i in range(len(cause.parts))]
+    best = sorted(choices, key=lambda c: -screen.ln_evidence(c))[:3]
+    guesses = [screen.guess(forward, c) for c in best]
+    rng, (_, noise) = np.random.default_rng(seed), guesses[0]
+    begun = [(proposal, 1.0) for proposal, _ in guesses]
+    first, found = sample(forward, noise, begun, rng, 200.0, (1000,) * 6)
+    return sample(forward, first.noise, found, rng, effective, ROUNDS)[0]
 
 
 def straight_line(seed: int, *idle: Prior, lower: float = -np.inf) -> Campaigns:
@@ -46,30 +78,12 @@ def straight_line(seed: int, *idle: Prior, lower: float = -np.inf) -> Campaigns:
     return Campaigns((o,), few.view, at, few.case)
 
 
-def lifted(found: Fit) -> float:
-    """By how much Laplace's evidence is more than that at the fit's noise, averaged over it."""
-    data, psi = found.forward.data, found.psi[None]
-    problem = Residuals(data, found.forward)
-    raw = problem.raw(psi)
-    jacobian = problem.jacobian(psi, raw, problem.raw(problem.around(psi)))
-    scaled = jacobian / problem.sds(found.noise)
-    precision = np.where(problem.precision > 0, problem.precision, 1e-3 / problem.width)
-    inverse = np.linalg.inv(scaled[0] @ scaled[0].T + np.diag(precision**2))
-    left = variance_left(scaled, inverse[None])
-    return float(
-        sum(
-            ln_averaging(raw[:, part], left[:, part], data.at_rows[o])[0]
-            for o, part in problem.parts.items()
-        )
-    )
-
-
 def averaged_log_joint(found: Fit, psi: np.ndarray) -> np.ndarray:
     """Log likelihood, averaged over the noise, plus log prior, in all dimensions."""
     problem = Residuals(found.forward.data, found.forward)
     with np.errstate(all="ignore"):
-        averaged = problem.ln_averaged(problem.raw(problem.clip(psi)))
-    return np.asarray(found.forward.priors.log_prob(psi) + averaged)
+        averaged = problem.ln_averaged(problem.raw(psi))
+    return np.asarray(found.forward.log_prior(psi) + averaged)
 
 
 def log_joint(found: Fit, psi: np.ndarray) -> np.ndarray:
@@ -77,6 +91,6 @@ def log_joint(found: Fit, psi: np.ndarray) -> np.ndarray:
     problem = Residuals(found.forward.data, found.forward)
     sds = problem.sds(found.noise)
     with np.errstate(all="ignore"):
-        squares = np.square(problem.raw(problem.clip(psi)) / sds).sum(axis=1)
+        squares = np.square(problem.raw(psi) / sds).sum(axis=1)
     constant = np.log(sds).sum() + 0.5 * sds.size * np.log(2.0 * np.pi)
-    return np.asarray(found.forward.priors.log_prob(psi) - 0.5 * squares - constant)
+    return np.asarray(found.forward.log_prior(psi) - 0.5 * squares - constant)

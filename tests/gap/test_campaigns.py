@@ -15,16 +15,14 @@ from calib.data import table_from_arrays
 from calib.errors import CalibError
 from calib.gap.campaigns import Campaigns, CaseSimulator, campaigns
 from calib.gap.case import Case
-from calib.gap.fit import fit
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import Hypothesis
-from calib.gap.noise import Noise
 from calib.inference.emulation.prepared import prepare
 from calib.inference.likelihood import log_normal
 from calib.inference.prior_files import DeclaredPriors, default_priors
 from calib.models.simulators.emulator import emulator_of
 from tests.gap.cases import PULL_ONLY, campaigns_of, make_case, table_without
-from tests.gap.fits import log_joint
+from tests.gap.fits import fitted, log_joint
 from tests.inference.emulation.test_emulate import as_before as as_before
 from tests.models.simulators.examples import PRIORS, lab, pull
 
@@ -309,9 +307,6 @@ def test_a_good_emulator_adds_next_to_nothing(tmp_path: Path) -> None:
     data = emulated(tmp_path, 60)
     simulated = data.simulated["drawbar_pull"]
     assert simulated.n_errors <= 2
-    forward = Forward(data, Hypothesis("none"), {"drawbar_pull": NOISE})
-    start = np.array([p.loc for p in forward.priors.free])
-    start[forward.misfit_slices["drawbar_pull"]] = 0.0
-    found = fit(forward, start, {"drawbar_pull": Noise(NOISE)})
+    found = fitted(data, Hypothesis("none"))
     assert np.isfinite(found.log_evidence)
     assert np.isfinite(log_joint(found, found.psi[None])).all()

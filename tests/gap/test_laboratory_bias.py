@@ -12,7 +12,7 @@ from calib.gap.hypotheses import Hypothesis
 from calib.gap.laboratory_bias import laboratory_bias
 from calib.gap.mixture import Mixture
 from tests.gap.cases import campaigns_of, diagnosis_of
-from tests.gap.fits import fit_at
+from tests.gap.fits import fit_at, moved
 
 
 @pytest.mark.filterwarnings("error")
@@ -27,7 +27,7 @@ def test_medians_spreads_and_shifts_are_those_of_weighted_draws():
     elsewhere[part] = 5.0
     mixed = Mixture(data, (replace(middle, sample=draws),), (1.0,), 1)
     (o,) = data.outputs
-    spread, narrow, *_ = laboratory_bias(mixed, replace(middle, psi=elsewhere))
+    spread, narrow, *_ = laboratory_bias(mixed, moved(middle, elsewhere))
     t = np.tile(middle.psi[part], (4, 1))
     t[:, 0] = (0.16, 0.5, 0.84, 5.0)
     t[3] = 5.0
@@ -42,10 +42,10 @@ def test_medians_spreads_and_shifts_are_those_of_weighted_draws():
 
 
 def test_every_free_parameter_is_there_and_a_cause_that_is_ignored_moves_some():
-    for effect, moved in ((None, False), ("rate_effect", True)):
+    for effect, shifted in ((None, False), ("rate_effect", True)):
         found = diagnosis_of(effect)
         d = gap_document(found)
         names = [(o.name, p.name) for o in found.data.outputs for p in o.priors.free]
         assert [(b.output, b.parameter) for b in d.laboratory_bias] == names
         # Where nothing acts the same posterior is summarised, at its median and its mode.
-        assert (max(abs(b.shift_in_sds) for b in d.laboratory_bias) >= 1.0) == moved
+        assert (max(abs(b.shift_in_sds) for b in d.laboratory_bias) >= 1.0) == shifted

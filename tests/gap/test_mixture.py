@@ -23,7 +23,7 @@ from calib.gap.mixture import (
 )
 from calib.gap.noise import Noise
 from tests.gap.cases import CHOICE, LARGE, campaigns_of, diagnosis_of
-from tests.gap.fits import SIGMA, fit_at
+from tests.gap.fits import SIGMA, fit_at, moved
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +36,7 @@ def offset_fit(data, offset: float):
     found = fit_at(data, single)
     psi = found.psi.copy()
     psi[found.forward.phi_slices[0]] = offset
-    return replace(found, psi=psi)
+    return moved(found, psi)
 
 
 def test_readings_have_noise_in_their_own_unit_and_relative_noise_of_ruts(data):
@@ -301,7 +301,7 @@ def pair_of(offset: float, drift: float):
     for each in found.forward.form_slices.values():
         for part in each:
             psi[part] = 0.0
-    return data, replace(found, psi=psi)
+    return data, moved(found, psi)
 
 
 def test_the_size_of_a_cause_is_what_goes_with_it_over_all_field_rows():

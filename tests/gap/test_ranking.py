@@ -10,7 +10,6 @@ import pytest
 from scipy.optimize import brentq
 from scipy.stats import norm
 
-import calib.gap.odds as module
 from calib.data import table_from_arrays
 from calib.data.quantities import OUTPUTS, physical_role
 from calib.errors import CalibError
@@ -27,9 +26,9 @@ from calib.gap.odds import (
     likelihood_tempering,
     probabilities,
     sizes,
-    sizes_of_all,
 )
-from calib.gap.ranking import calibrate_lab, change_over_runs, rank
+from calib.gap.ranking import calibrate_lab, rank
+from calib.gap.screen import Screen
 from calib.inference.mode import prior_widths
 from tests.gap.cases import (
     CHOICE,
@@ -40,7 +39,7 @@ from tests.gap.cases import (
     parameters,
     ranking_of,
 )
-from tests.gap.fits import SIGMA, fit_at
+from tests.gap.fits import SIGMA, draws_of, fit_at
 
 
 @pytest.mark.parametrize("name", [None, *LARGE])
@@ -190,9 +189,6 @@ def test_a_gauge_of_ruts_that_jumps_or_drifts_is_named(name):
     ranking = rank(campaigns(case), 1, effects=few)
     assert ranking.order[0] == (name or "none")
     assert inclusion_probability(ranking.probability).get(name or "", 1.0) >= 0.8
-    # Where nothing follows the runs they are not worth a fit.
-    assert ("rut_depth_step" in ranking.fits) == ("rut_depth_drift" in ranking.fits)
-    assert ("rut_depth_step" in ranking.fits) == (name is not None)
 
 
 def test_ground_that_changes_over_the_runs_is_no_instrument():
@@ -401,11 +397,6 @@ def fit_of(case: str | None, name: str):
     return ranking_of(case).fits[name][0]
 
 
-def ln_size_restriction(fit, seed: int, draws: int) -> float:
-    (found,) = module.ln_size_restriction([(fit, draws)], seed)
-    return found
-
-
 def test_size_is_in_noise_sds_of_the_output_where_it_is_largest():
     fit = fit_of("force_offset", "force_offset")
     psi = np.tile(fit.psi, (2, 1))
@@ -420,75 +411,40 @@ def test_size_is_in_noise_sds_of_the_output_where_it_is_largest():
     assert size[1, 0] == pytest.approx(np.sqrt(np.mean(np.square(in_noise))))
 
 
-@pytest.mark.parametrize("case", ["force_offset", None])
-def test_it_is_the_posterior_share_of_relevant_sizes_over_the_prior_share(case):
-    """Of an offset both are shares of a normal beyond 1.5 noise sds on either side."""
-    fit = fit_of(case, "force_offset")
-    (part,) = fit.forward.phi_slices
-    (prior,) = fit.forward.hypothesis.effect_priors[0].free
-    at = noise_conditions(fit.forward.data.view)
-    rows = fit.forward.data.outputs[0].rows
-    bar = 1.5 / np.sqrt(np.mean(np.square(1.0 / fit.noise["drawbar_pull"].sd(at.rows(rows)))))
-
-    def beyond(mean, sd):
-        return norm.sf(bar, mean, sd) + norm.cdf(-bar, mean, sd)
-
-    # A form error of the size would make it another's.
-    assert not any(s.stop > s.start for each in fit.forward.form_slices.values() for s in each)
-    n = 20_000
-    draws = fit.draws(np.random.default_rng(2), n)[:, part.start]
-    after = beyond(draws.mean(), draws.std())
-    found = ln_size_restriction(fit, 1, n)
-    shares = (after * n + 0.2) / (n + 0.4), beyond(prior.loc, prior.scale)
-    # Sds of a logarithm of a share: of the posterior, where it is small, some draws.
-    sd = np.sqrt((1.0 - shares[0]) / (n * shares[0]) + (1.0 - shares[1]) / (n * shares[1]))
-    assert found == pytest.approx(np.log(shares[0] / shares[1]), abs=5.0 * sd + 0.02)
+def test_the_prior_share_of_relevant_sizes_is_that_of_its_distribution():
+    """Of an offset: a normal beyond 1.5 noise sds on either side, one in ten four times as wide."""
+    data = campaigns_of("force_offset")
+    lab_mode, noise = calibrate_lab(data, 1)
+    (h,) = singles(data, {"force_offset": EFFECTS["force_offset"]})
+    cause = Screen(data, lab_mode, noise, 1).cause(h)
+    (prior,) = h.effect_priors[0].free
+    at = noise_conditions(data.view).rows(data.outputs[0].rows)
+    for bar, found in ((1.5, cause.ln_relevant), (1.0, cause.ln_relevant_in_set)):
+        least = bar / np.sqrt(np.mean(np.square(1.0 / noise["drawbar_pull"].sd(at))))
+        usual, wide = (
+            norm.sf(least, prior.loc, sd) + norm.cdf(-least, prior.loc, sd)
+            for sd in (prior.scale, 4.0 * prior.scale)
+        )
+        # Of a thousand draws of a Latin hypercube, the wide ones picked at random.
+        assert np.exp(found) == pytest.approx(0.9 * usual + 0.1 * wide, abs=0.02)
 
 
-def test_sizes_of_many_hypotheses_are_those_of_each():
-    """Whatever is asked for at once: of sets, shifts and discrepancies, few draws and many."""
+def test_of_several_causes_the_size_of_each_is_what_goes_with_it():
     ranking = ranking_of("lug_thrust")
-    rng = np.random.default_rng(4)
-    asked = []
-    for name, n in (("lug_thrust", 700), ("parameter_shift", 3), ("unknown", 90), ("none", 2),
-                    ("lug_thrust+slip_sinkage", 900), ("parameter_shift+unknown", 5)):  # fmt: skip
-        if name in ranking.fits:
-            fit = ranking.fits[name][0]
-            asked.append((fit.forward, fit.noise, fit.draws(rng, n)))
-    assert len(asked) >= 5
-    every = sizes_of_all(asked)
-    for (forward, noise, psi), found in zip(asked, every, strict=True):
-        assert found.shape == (len(psi), max(1, len(forward.causes)))
-        some = slice(None, None, max(1, len(psi) // 3))
-        np.testing.assert_allclose(found[some], sizes(forward, noise, psi[some]), rtol=1e-9)
-        full = forward.field(psi[some], forward.data.view)
-        for j, cause in enumerate(forward.causes if len(forward.causes) > 1 else ()):
-            rest = forward.without(psi[some], forward.data.view, cause)
-            at = noise_conditions(forward.data.view)
-            written = np.max([
-                np.sqrt(np.mean(np.square(
-                    (full[o.name] - rest[o.name])[:, o.rows] / noise[o.name].sd(at.rows(o.rows))
-                ), axis=1)) for o in forward.data.outputs
-            ], axis=0)  # fmt: skip
-            np.testing.assert_allclose(found[some, j], written, rtol=1e-9)
-
-
-def least_squares(z: np.ndarray, shape: np.ndarray) -> float:
-    """Nats gained by a constant and a shape over a constant alone."""
-    basis = np.stack([np.ones(z.size), shape], axis=1)
-    left = z - basis @ np.linalg.lstsq(basis, z, rcond=None)[0]
-    return 0.5 * z.size * float(np.log(np.square(z - z.mean()).sum() / np.square(left).sum()))
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_it_is_the_best_of_a_line_and_of_every_step(seed):
-    rng = np.random.default_rng(seed)
-    n = int(rng.integers(6, 40))
-    order, z = rng.permutation(n) + 3.0, rng.standard_normal(n)
-    z += rng.normal(0.0, 2.0) * (order > rng.uniform(4.0, n)) + rng.normal(0.0, 0.1) * order
-    steps = [order > run for run in np.sort(order)[:-1]]
-    expected = max(least_squares(z, shape) for shape in (order, *steps))
-    assert change_over_runs(z, order) == pytest.approx(expected, rel=1e-9)
+    name = next(n for n in ranking.order if n.count("+") == 1)
+    fit = ranking.best(name)
+    psi = fit.draws(np.random.default_rng(4), 5)
+    found = sizes(fit.forward, fit.noise, psi)
+    full = fit.forward.field(psi, fit.forward.data.view)
+    for j, cause in enumerate(fit.forward.causes):
+        rest = fit.forward.without(psi, fit.forward.data.view, cause)
+        at = noise_conditions(fit.forward.data.view)
+        written = np.max([
+            np.sqrt(np.mean(np.square(
+                (full[o.name] - rest[o.name])[:, o.rows] / fit.noise[o.name].sd(at.rows(o.rows))
+            ), axis=1)) for o in fit.forward.data.outputs
+        ], axis=0)  # fmt: skip
+        np.testing.assert_allclose(found[:, j], written, rtol=1e-9)
 
 
 def test_shares_sizes_and_cosines_are_in_their_ranges():
@@ -640,10 +596,10 @@ def offset_of(data, offset: float, sd: float = 0.0):
     (single,) = singles(data, {"force_offset": CHOICE["force_offset"]})
     found = fit_at(data, single)
     part = found.forward.phi_slices[0]
-    psi, covariance = found.psi.copy(), np.zeros_like(found.covariance)
+    psi, root = found.psi.copy(), np.zeros_like(found.covariance)
     psi[part] = offset
-    covariance[part, part] = sd**2
-    return replace(found, psi=psi, covariance=covariance)
+    root[part, part] = sd
+    return replace(found, sample=draws_of(psi, root))
 
 
 def test_two_in_play_are_told_apart_where_their_gain_is_largest():

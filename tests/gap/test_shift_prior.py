@@ -16,6 +16,7 @@ from calib.gap.forward import Forward
 from calib.gap.hypotheses import Hypothesis
 from calib.gap.noise import Noise
 from tests.gap.cases import MODELS, NOISE, campaigns_of
+from tests.gap.fits import draws_of
 
 SCRIPT = Path(__file__).resolve().parents[2] / "benchmarks" / "shift_prior.py"
 
@@ -43,7 +44,9 @@ def test_it_sees_a_shift_in_prior_sds(script: ModuleType) -> None:
     prior = np.array([p.scale for p in forward.priors.free]) ** -2.0
     covariance = np.diag(1.0 / (np.where(np.isfinite(prior), prior, 0.0) + 400.0))
     noise = {o: Noise(s) for o, s in sigma.items()}
-    found = script.seen(Fit(forward, psi, covariance, noise, 0.0, 0.0, {}), data.outputs)
+    found = script.seen(
+        Fit(forward, noise, 0.0, {}, draws_of(psi, np.sqrt(covariance))), data.outputs
+    )
     np.testing.assert_allclose(np.diag(found.precision), 400.0, rtol=1e-9)
     names = [
         q

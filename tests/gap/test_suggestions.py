@@ -82,6 +82,7 @@ def test_a_loss_at_the_middle_pressure_is_suggested_of_the_pull_alone():
     case = replace(case, field=table_from_arrays(columns))
     best, *others = gap_document(diagnose_once(case, 1, effects=few)).suggestions
     assert (best.kind, best.factor, best.rises) == ("quadratic", True, True)
-    assert best.columns == ("inflation_pressure_psi",)
+    # On one tyre the one pressure goes with the other.
+    assert best.columns in {("inflation_pressure_psi",), ("average_ground_pressure_kpa",)}
     assert best.probability > 0.9
     assert {s.output for s in (best, *others)} == {"drawbar_pull"}
