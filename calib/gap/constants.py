@@ -88,7 +88,7 @@ SURPRISE = 1.25  # 1; widens the lower end of a shrink to hold 90 % of blind cas
 ALIKE = 0.95  # cosine from which a design cannot tell two effects apart; test_ranking
 
 
-# How sets of causes are screened, and posteriors drawn; test_screen, test_posterior.
+# How sets of causes are screened, and posteriors drawn; test_ranking, test_posterior.
 PRIOR_DRAWS = 1024  # of each cause
 PARTS = 8  # normals that stand for an effect's prior draws
 RANK = 8  # directions in which the rows of a part vary
@@ -103,3 +103,4 @@ FIRST, FIRST_ROUNDS = 100.0, (1000,) * 4  # effective draws that a first look as
 IN_PLAY = 6.0  # nats behind the best, by first looks that are up to two too low
 PLENTY = 1280.0  # effective draws; evidence within 0.04 nats (one sd)
 ROUNDS = (2000,) * 7 + (4000,)  # draws
+FEWEST_DRAWS = 100.0  # effective; with fewer an evidence has an error of 0.1 nats: said first

@@ -21,12 +21,14 @@ from calib.data.quantities import OUTPUTS, QUANTITIES, Quantity, columns_of, rol
 from calib.gap.campaigns import Campaigns, OutputData, identical_rows
 from calib.gap.constants import (
     FAR_RATIO,
+    FEWEST_DRAWS,
     HELD,
     NEAR_UNIT,
     NOISIER,
     ODD_RATIO,
     PERCENT_RATIO,
     ROUGHLY_UNIT,
+    WORTH_SAYING,
 )
 from calib.gap.fit import Fit
 from calib.gap.ranking import Ranking
@@ -257,7 +259,7 @@ def _times(lab: Array, field: Array, quantity: Quantity, near: float = NEAR_UNIT
 def doubts(data: Campaigns, ranking: Ranking) -> tuple[Remark, ...]:
     """Say what no explanation has: in a field as it says, any is said with a chance of `LEVEL`."""
     best = ranking.best(ranking.order[0])
-    return failed(
+    return _converged(ranking) + failed(
         [
             check
             for o in data.outputs
@@ -266,6 +268,26 @@ def doubts(data: Campaigns, ranking: Ranking) -> tuple[Remark, ...]:
                 *_patterns(data, o, ranking, best),
             )
         ]
+    )
+
+
+def _converged(ranking: Ranking) -> tuple[Remark, ...]:
+    """Whether the draws of every explanation in play are enough for its probability."""
+    draws = {
+        name: ranking.best(name).effective
+        for name in ranking.order
+        if ranking.probability[name] >= WORTH_SAYING
+    }
+    few = [f"{name} ({n:.0f})" for name, n in draws.items() if n < FEWEST_DRAWS]
+    if not few:
+        return ()
+    said = f"the sampler did not converge: too few effective draws of {', '.join(few)}"
+    return (
+        Remark(
+            f"{said}, fewer than {FEWEST_DRAWS:.0f}; probabilities may be off by more than 0.05: "
+            "give tighter priors, or more rows",
+            said,
+        ),
     )
 
 

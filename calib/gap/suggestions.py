@@ -94,14 +94,16 @@ def suggest(
     nothing, *p = softmax([0.0, *evidence]).tolist()
     looks = [_without(base, x[each.argmax()]) for (*_, x), each in zip(terms, ln, strict=True)]
     looks = [x / max(float(np.linalg.norm(x)), 1e-300) for x in looks]
-    # Of terms that look the same on these rows the simplest stands for all: it is listed first.
+    # Of terms that look the same on these rows the most probable of the fewest conditions stands
+    # for all.
     alike: dict[int, list[int]] = {}
     for i in sorted(range(len(p)), key=lambda i: -p[i]):
         same = next((j for j in alike if abs(looks[j] @ looks[i]) >= ALIKE), i)
         alike.setdefault(same, []).append(i)
     found = []
     for group in alike.values():
-        i, together = min(group), sum(p[j] for j in group)
+        i = min(group, key=lambda j: (len(terms[j][1]), -p[j]))
+        together = sum(p[j] for j in group)
         kind, columns, at, factor, x = terms[i]
         if together >= max(nothing, WORTH_SAYING) and (removed := _removed(y, base, x)) > 0.0:
             place, up = float(at[ln[i].argmax()]), bool(looks[i] @ y > 0.0)

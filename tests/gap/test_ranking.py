@@ -27,6 +27,7 @@ from calib.gap.odds import (
     probabilities,
     sizes,
 )
+from calib.gap.plausibility import doubts
 from calib.gap.ranking import calibrate_lab, rank
 from calib.gap.screen import Screen
 from calib.inference.mode import prior_widths
@@ -609,3 +610,14 @@ def test_two_in_play_are_told_apart_where_their_gain_is_largest():
     (found,) = next_measurements(data, fits, 1)
     assert found.separates == ("one", "other")
     assert np.isclose(found.gain_nats, 0.5 * (0.3 / SIGMA["drawbar_pull"]) ** 2)
+
+
+def test_too_few_draws_of_an_explanation_in_play_are_said_first():
+    ranking = ranking_of("force_offset")
+    data = ranking.best("none").forward.data
+    assert not any("converge" in remark.text for remark in doubts(data, ranking))
+    few = tuple(replace(fit, effective=40.0) for fit in ranking.fits["force_offset"])
+    starved = replace(ranking, fits={**ranking.fits, "force_offset": few})
+    assert doubts(data, starved)[0].title == (
+        "the sampler did not converge: too few effective draws of force_offset (40)"
+    )

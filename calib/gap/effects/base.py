@@ -253,19 +253,6 @@ class Effect:
         """
         return np.maximum(mean_response, 0.0)
 
-    def begun(self, phi: Array, left: Mapping[str, Array], view: View) -> Array:
-        """Return guesses from which a fit may begin better than from draws of the prior.
-
-        Parameters
-        ----------
-        phi : ndarray, shape (k, n_parameters)
-            Draws of the prior.
-        left : mapping of str to ndarray, shape (n,)
-            By the role of the output, what a fit without the effect leaves of the field's
-            readings, on the scale of the response; NaN where there is none.
-        """
-        return phi
-
     def shape(self, view: View) -> Array | None:
         """Return the covariate along which the effect's form is least certain, shape (n,)."""
         return None

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from calib.gap.effects.base import Conditions, Effect, View, each, saturating, words
@@ -11,9 +9,6 @@ from calib.models.base import Array
 
 EARLY = "zero and span, and an early run once more"
 """How a reading that changes over the runs is checked."""
-
-# Curvature and half-way part of drifts: warming up, steady, late, and from one level to another.
-_SHAPES = ((0.8, 0.15), (1.0, 5.0), (3.0, 3.0), (3.0, 0.5), (6.0, 0.25), (6.0, 0.5), (6.0, 0.75))
 
 
 class _Fault(Effect):
@@ -63,12 +58,6 @@ def _grown(curvature: Array, half_way: Array, view: View) -> Array:
     return saturating(np.maximum(_progress(view), 1e-3), curvature, half_way)
 
 
-def _zero_at(before: Array, size: Array) -> Array:
-    """Part of a change at which the gauge was zeroed, by what it read before the change."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.clip(np.nan_to_num(-before / size, nan=0.5), 0.05, 0.95)
-
-
 class SensorDrift(_Fault):
     """A drift with run order: steady, settling, or from some run on; zeroed at any part of it."""
 
@@ -87,25 +76,6 @@ class SensorDrift(_Fault):
         drift, curvature, half_way, zero_at = each(phi)
         grown = _grown(curvature, half_way, view)
         return np.asarray(mean_response + drift * (grown - zero_at))
-
-    def begun(self, phi: Array, left: Mapping[str, Array], view: View) -> Array:
-        """Begin with drifts of several shapes, each as large and zeroed where it suits best.
-
-        Between shapes there are modes from which no fit gets away. Besides these shapes those that
-        were drawn, for a shape may be known.
-        """
-        residual = left[self.outputs[0]]
-        known = np.isfinite(residual)
-        if not known.any():
-            return phi
-        begun = phi.copy()
-        begun[: len(_SHAPES), 1:3] = _SHAPES[: len(phi)]
-        _, curvature, half_way, _ = each(begun)
-        grown, residual = _grown(curvature, half_way, view)[:, known], residual[known]
-        mean = grown.mean(axis=1, keepdims=True)
-        begun[:, 0] = (grown - mean) @ residual / (np.square(grown - mean).sum(axis=1) + 0.05)
-        begun[:, 3] = _zero_at(residual.mean() - begun[:, 0] * mean[:, 0], begun[:, 0])
-        return begun
 
     def shape(self, view: View) -> Array | None:
         """Run order."""
@@ -138,20 +108,6 @@ class SensorStep(_Fault):
             return mean_response
         jump, zero_at, *_ = each(phi)
         return np.asarray(mean_response + jump * (self._beyond(phi, view) - zero_at))
-
-    def begun(self, phi: Array, left: Mapping[str, Array], view: View) -> Array:
-        """Begin with mean residuals on both sides, and wide: from a sharp step no fit gets away."""
-        begun = phi.copy()
-        begun[:, 3] = 0.1
-        residual = left[self.outputs[0]]
-        known = np.isfinite(residual)
-        beyond = self._beyond(begun, view)[:, known]
-        before, after = (
-            part @ residual[known] / (part.sum(axis=1) + 0.5) for part in (1.0 - beyond, beyond)
-        )
-        begun[:, 0] = after - before
-        begun[:, 1] = _zero_at(before, begun[:, 0])
-        return begun
 
 
 class PressureGaugeBias(_Fault):

@@ -102,10 +102,6 @@ class Reading(Effect):
         true = np.exp(mean_response)
         return np.log(np.maximum(self._as.on_output(phi, "pull", true, view), 0.05 * true))
 
-    def begun(self, phi: Array, left: Mapping[str, Array], view: View) -> Array:
-        """Begin as the drawbar cell does."""
-        return self._as.begun(phi, {"pull": left[self.outputs[0]]}, view)
-
     def shape(self, view: View) -> Array | None:
         """Run order, of a drift."""
         return self._as.shape(view)
