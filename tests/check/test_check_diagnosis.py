@@ -97,7 +97,7 @@ def field(folder: Path) -> None:
 def corrected(folder: Path) -> None:
     path = folder / "corrected.json"
     content = json.loads(path.read_text())
-    content["fits"][0]["psi"][2] *= 1.3
+    content["fits"][0]["sample"] = [[1.3 * v for v in row] for row in content["fits"][0]["sample"]]
     path.write_text(json.dumps(content) + "\n")
 
 

@@ -78,7 +78,7 @@ def change_where(whole: Path) -> None:
 def change_corrected(whole: Path) -> None:
     path = whole / "gaps/plain_bekker/corrected.json"
     content = json.loads(path.read_text())
-    content["fits"][0]["psi"][2] *= 1.1
+    content["fits"][0]["sample"] = [[1.1 * v for v in row] for row in content["fits"][0]["sample"]]
     path.write_text(json.dumps(content) + "\n")
 
 

@@ -128,8 +128,9 @@ def test_a_folder_is_in_the_units_of_the_files_checks_and_is_rendered_again(tmp_
     )
     assert f"from {before} to {after} N rms" in reader.text
     assert f"noise sd of a reading {noise} N" in reader.text
-    # Parameters are in their own units, here kN; their definitions name a pressure.
-    assert set(re.findall(r"[\d.]+ (mm|psi|kPa|m/s|kN)\b", reader.text)) == {"kN", "kPa", "psi"}
+    # Parameters are in their own units, here kN and mm; their definitions name a pressure.
+    units = set(re.findall(r"[\d.]+ (mm|psi|kPa|m/s|kN)\b", reader.text))
+    assert units == {"kN", "mm", "kPa", "psi"}
     # The ground pressure is in the file's psi.
     assert re.findall(r".{7}[\d.]+ psi\b", reader.text) == ["18 and 42 psi", "8.5 to 28.2 psi"]
     figures = [p.figure for p in gap_plates(load_document(out))]
