@@ -178,6 +178,8 @@ def test_table_4_is_the_global_optimum(files: dict[str, Columns], psi: int) -> N
     *published, cost = TABLE_4[psi]
     with np.errstate(all="ignore"):
         fits = [exact_fit(lambda t: magic(t, slip), pull, start) for start in starts]
+    # The curve is the same for -B and -D; which of the two costs less is a matter of rounding.
+    fits = [(t * np.sign(t[2]) ** np.array([1, 0, 1, 0]), sse) for t, sse in fits]
     best, least = min(fits, key=lambda found: found[1])
     assert np.round(best, 4) == pytest.approx(published, abs=1e-12)
     assert best == pytest.approx(published, abs=1e-5)
