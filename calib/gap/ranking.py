@@ -182,6 +182,8 @@ class Candidate:
         Log of evidence times prior, by the screen.
     ln_relevant : float
         Log prior probability that its causes are large enough to count.
+    ln_restricted : float
+        That of all variants of its name.
     choices : tuple of (float, tuple of (Cause, int))
         Log evidence of each choice of a part, by its place, for each of its causes.
     """
@@ -190,6 +192,7 @@ class Candidate:
     promise: float
     ln_relevant: float
     choices: tuple[tuple[float, Chosen], ...]
+    ln_restricted: float = 0.0
 
     @property
     def name(self) -> str:
@@ -233,10 +236,30 @@ def _candidates(
         relevant = some[0].ln_relevant if len(some) == 1 else relevant
         chosen = [(c.ln_evidence, tuple((causes[n], i) for n, i in c.parts)) for c in group]
         found.append(Candidate.of(h, odds, relevant, chosen))
-    found += _with_residuals(screen, odds, found)
+    found = _restricted(found)
+    found += _restricted(_with_residuals(screen, odds, found))
     least = max(c.promise for c in found) - CUT
     best = {c.name: c for c in sorted(found, key=lambda c: c.promise)}
     return [c for c in found if c.promise > least or ("+" not in c.name and best[c.name] is c)]
+
+
+def _restricted(found: Sequence[Candidate]) -> list[Candidate]:
+    """Restrict the prior of each name to what counts, in whichever variant it is likely to.
+
+    A variant of small sizes, which hardly ever count, is not as probable as one of large sizes.
+    """
+    of_name: dict[str, float] = {}
+    for name in {c.name for c in found}:
+        own = [c for c in found if c.name == name]
+        ln_share = np.log([c.hypothesis.share for c in own])
+        ln_both = ln_share + [c.ln_relevant for c in own]
+        of_name[name] = float(logsumexp(ln_both) - logsumexp(ln_share))
+    return [
+        replace(
+            c, promise=c.promise + c.ln_relevant - of_name[c.name], ln_restricted=of_name[c.name]
+        )
+        for c in found
+    ]
 
 
 def _with_residuals(screen: Screen, odds: Odds, found: Sequence[Candidate]) -> list[Candidate]:
@@ -329,7 +352,7 @@ def _score(screen: Screen, c: Candidate, fit: Fit, every: int) -> float:
     if not c.choices[0][1]:  # nothing acts
         return score
     size = sizes(fit.forward, screen.noise, fit.sample[::every])
-    return score + ln_relevant(size) - c.ln_relevant
+    return score + ln_relevant(size) - c.ln_restricted
 
 
 def _stream(h: Hypothesis, seed: int, stage: str) -> np.random.Generator:

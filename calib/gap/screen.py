@@ -299,7 +299,7 @@ def _parts(white: Array, psi: Array, split: bool, rng: np.random.Generator) -> t
                 v[:r].T * s[:r] / np.sqrt(n),
                 psi_mean,
                 slope,
-                left.T @ left / n + 1e-8 * np.diag(of_psi.var(axis=0)),
+                left.T @ left / n + np.diag(psi.var(axis=0)) / n,
             )
         )
     return tuple(found)

@@ -312,8 +312,6 @@ def test_another_reading_changes_over_the_runs_as_the_drawbar_cells(kind, of_cel
     ]  # fmt: skip
     np.testing.assert_allclose(effect.on_output(phi, role, y, view), expected, rtol=1e-12)
     assert effect.on_output(phi, "pull", y, view) is y
-    begun = effect.begun(phi, {role: np.full(N, 0.1), "pull": np.full(N, np.nan)}, view)
-    assert np.isfinite(begun).all()
 
 
 def test_a_gain_is_a_factor_and_an_offset_is_in_the_readings_unit_in_logarithms_too():
