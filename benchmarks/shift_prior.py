@@ -63,7 +63,7 @@ def see(seed: np.random.SeedSequence, tier: Tier) -> Seen | None:
         for size in SHIFTS:
             hypothesis = Hypothesis("parameter_shift", shift=size)
             forward, cause = screen.forward(hypothesis), screen.cause(hypothesis)
-            guess, noise = screen.guess(forward, [(cause, 0)])
+            guess, noise = screen.guess(forward, ((cause, 0),))
             rng = np.random.default_rng(0)
             fits.append(sample(forward, noise, [(guess, 1.0)], rng, PLENTY, ROUNDS)[0])
     best = max(fits, key=lambda f: f.log_evidence)

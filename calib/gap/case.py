@@ -97,8 +97,13 @@ class Context(_Strict):
 
     def words(self, units: Mapping[tuple[str, str], str] | None = None) -> list[str]:
         """Say what was put in; sizes with the units of (effect, parameter), if they are given."""
-        said = {None: [], True: ["the same soil"], False: ["another soil"]}[self.same_soil]
-        said += [f"{n.replace('_', ' ')} suspected ({p:g})" for n, p in self.suspected.items()]
+        suspected, said = dict(self.suspected), []
+        if self.same_soil is not None:
+            said.append("the same soil" if self.same_soil else "another soil")
+            if suspected["parameter_shift"] == SHIFT_PRIOR[self.same_soil]:
+                usual = suspected.pop("parameter_shift")
+                said[-1] += f" (prior probability of a parameter shift {usual:g})"
+        said += [f"{n.replace('_', ' ')} suspected ({p:g})" for n, p in suspected.items()]
         said += [f"{name.replace('_', ' ')} excluded" for name in self.excluded]
         said += [
             f"{name.replace('_', ' ')}: {parameter} {size.mean:g} ± {size.sd:g}"
@@ -248,14 +253,21 @@ def read_context(content: Any, where: str) -> Context:
         context = Context.model_validate({} if content is None else content)
     except ValidationError as error:
         first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
+        place, key = ".".join(str(part) for part in first["loc"]), next(map(str, first["loc"]), "")
+        unknown = first["type"] == "extra_forbidden" and len(first["loc"]) == 1
         raise CalibError(
-            in_words(first),
+            f"unknown key {key}" if unknown else in_words(first),
             where=f"{where}, context.{place}",
             expected="same_soil = true or false, suspected = {name = probability}, "
             "excluded = [names], sizes = {name = {parameter = {mean = …, sd = …}}}",
-            hint="write, for example: suspected = {lug_thrust = 0.5} and, in the next line, "
-            'excluded = ["sensor_drift"]',
+            hint=meant(key, [*Context.model_fields], "correct its name, or leave it out")
+            if unknown
+            else "write, for example: "
+            + {
+                "same_soil": "same_soil = true",
+                "excluded": 'excluded = ["sensor_drift"]',
+                "sizes": "sizes = {force_offset = {offset = {mean = 0.1, sd = 0.02}}}",
+            }.get(key, "suspected = {lug_thrust = 0.5}"),
         ) from None
     if twice := set(context.suspected) & set(context.excluded):
         raise CalibError(

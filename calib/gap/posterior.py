@@ -48,6 +48,15 @@ def _forms(forward: Forward) -> NDArray[np.int64]:
     return np.concatenate([np.arange(0), *(np.arange(s.start, s.stop) for s in slices)])
 
 
+def as_normal(forward: Forward) -> tuple[Array, Array]:
+    """Return means and inverse sds of the priors, shape (d,), uniform ones as normal as well."""
+    loc, _, lower, upper, precision = forward.priors._arrays
+    normal = precision > 0.0
+    with np.errstate(invalid="ignore"):
+        middle, width = 0.5 * (lower + upper), np.sqrt(12.0) / (upper - lower)
+    return np.where(normal, loc, middle), np.where(normal, precision, width)
+
+
 class Density:
     """Likelihood times prior of a hypothesis, averaged over the noise.
 
@@ -245,8 +254,9 @@ def sample(
             pool.add(proposal, rng, max(int(size * weight / whole), 50))
         log_weight = pool.log_weight()
         total = float(logsumexp(log_weight))
-        if not np.isfinite(total):
-            break
+        if not np.isfinite(total):  # a guess may lie outside the bounds
+            proposals, whole = [(_of_prior(forward), 1.0)], 1.0
+            continue
         share = np.exp(log_weight - total)
         reached = 1.0 / float(np.square(share).sum())
         moved = _moved(forward, pool, log_weight, share)
@@ -272,6 +282,12 @@ def sample(
     left = dict(zip(forward.data.names, np.split(standardised, ends), strict=True))
     fit = Fit(forward, found, total + _ln_mean(ln_factor), left, psi, reached)
     return fit, proposals
+
+
+def _of_prior(forward: Forward) -> StudentT:
+    """Return a proposal as wide as the prior."""
+    u, (loc, precision) = searched(forward), as_normal(forward)
+    return StudentT(loc[u], np.diag(1.0 / precision[u]), DOF)
 
 
 def _moved(forward: Forward, pool: _Pool, log_weight: Array, share: Array) -> list[Proposed]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -47,7 +47,7 @@ from calib.gap.odds import (
     sizes,
 )
 from calib.gap.posterior import Proposed, sample
-from calib.gap.screen import Cause, Choice, Screen
+from calib.gap.screen import Choice, Screen
 from calib.inference.mode import find_mode
 from calib.inference.random import generator
 from calib.inference.search import check_defined
@@ -67,6 +67,8 @@ class Ranking:
         By name; several where prior scales, or ways to shift or to be unlisted, were averaged over.
     scores : mapping of str to tuple of float
         Log evidence of each fit, for effects that matter, times its share in its hypothesis.
+    shares : mapping of str to float
+        How probable all variants of a name were beforehand, of what is usual for such a name.
     probability : mapping of str to float
         Sums to one.
     not_testable : mapping of str to str
@@ -84,6 +86,7 @@ class Ranking:
 
     fits: Mapping[str, tuple[Fit, ...]]
     scores: Mapping[str, tuple[float, ...]]
+    shares: Mapping[str, float]
     log_evidence: Mapping[str, float]
     probability: Mapping[str, float]
     not_testable: Mapping[str, str]
@@ -105,11 +108,8 @@ class Ranking:
     @property
     def prior(self) -> dict[str, float]:
         """Probability of each hypothesis before the data; sums to one."""
-        shares = {
-            name: min(sum(f.forward.hypothesis.share for f in group), 1.0)
-            for name, group in self.fits.items()
-        }
-        return probabilities({n: float(np.log(s)) for n, s in shares.items()}, self.odds)
+        ln_share = {name: float(np.log(share)) for name, share in self.shares.items()}
+        return probabilities(ln_share, self.odds)
 
     @property
     def in_play(self) -> dict[str, Fit]:
@@ -159,17 +159,15 @@ def rank(
     alone -= set(context.excluded)
     odds = Odds.of(len(single) - len(alone), context)
     screen = Screen(data, lab_mode, noise, seed)
-    candidates = _candidates(screen, odds, single, alone)
+    candidates, tried = _candidates(screen, odds, single, alone)
     fits, scores = _scored(screen, candidates, odds, seed, plenty)
     log_evidence = {name: float(logsumexp(values)) for name, values in scores.items()}
     best = max(log_evidence, key=lambda name: log_evidence[name] + odds.ln_prior(name))
     gap = gap_size(fits[best][int(np.argmax(scores[best]))])
     probability = probabilities(log_evidence, odds, likelihood_tempering(gap))
-    return Ranking(fits, scores, log_evidence, probability, unable, lab_mode, design, odds, gap)
-
-
-# A part of each cause, by its place.
-type Chosen = tuple[tuple[Cause, int], ...]
+    return Ranking(
+        fits, scores, tried, log_evidence, probability, unable, lab_mode, design, odds, gap
+    )
 
 
 @dataclass(frozen=True)
@@ -184,14 +182,14 @@ class Candidate:
         Log prior probability that its causes are large enough to count.
     ln_restricted : float
         That of all variants of its name.
-    choices : tuple of (float, tuple of (Cause, int))
-        Log evidence of each choice of a part, by its place, for each of its causes.
+    choices : tuple of Choice
+        Of parts of its causes.
     """
 
     hypothesis: Hypothesis
     promise: float
     ln_relevant: float
-    choices: tuple[tuple[float, Chosen], ...]
+    choices: tuple[Choice, ...]
     ln_restricted: float = 0.0
 
     @property
@@ -199,48 +197,52 @@ class Candidate:
         """Of the hypothesis."""
         return self.hypothesis.name
 
+    @property
+    def best(self) -> list[Choice]:
+        """Choices, the best first."""
+        return sorted(self.choices, key=lambda choice: -choice.ln_evidence)
+
     @classmethod
     def of(
-        cls, h: Hypothesis, odds: Odds, ln_relevant: float, choices: Iterable[tuple[float, Chosen]]
+        cls, h: Hypothesis, odds: Odds, ln_relevant: float, choices: Sequence[Choice]
     ) -> Candidate:
         """Add up choices."""
-        every = tuple(choices)
-        promise = float(logsumexp([value for value, _ in every]) + np.log(h.share))
-        return cls(h, promise + odds.ln_prior(h.name), ln_relevant, every)
+        promise = float(logsumexp([c.ln_evidence for c in choices]) + np.log(h.share))
+        return cls(h, promise + odds.ln_prior(h.name), ln_relevant, tuple(choices))
 
 
 def _candidates(
     screen: Screen, odds: Odds, single: Sequence[Hypothesis], alone: Collection[str]
-) -> list[Candidate]:
-    """Hypotheses that are near the best by the screen, and every cause by itself."""
-    data, none = screen.data, Hypothesis("none")
-    found = [Candidate.of(none, odds, 0.0, [(screen.ln_evidence(()), ())])]
+) -> tuple[list[Candidate], dict[str, float]]:
+    """Hypotheses near the best by the screen, and every cause by itself; each name's share."""
+    data = screen.data
+    found = [Candidate.of(Hypothesis("none"), odds, 0.0, [screen.choice(())])]
     for h in [*shifts(data), *unknowns(data)]:
         cause = screen.cause(h)
-        by_part = [((cause, i),) for i in range(len(cause.parts))]
-        if by_part:
-            of_parts = [(screen.ln_evidence(c), c) for c in by_part]
+        if of_parts := [screen.choice(((cause, i),)) for i in range(len(cause.parts))]:
             found.append(Candidate.of(h, odds, cause.ln_relevant, of_parts))
-    causes = {h.name: screen.cause(h) for h in single}
+    causes = [screen.cause(h) for h in single]
     groups = dict[tuple[str, ...], list[Choice]]()
     for choice in [
-        *screen.choices({n: c for n, c in causes.items() if n not in alone}),
-        *screen.choices({n: c for n, c in causes.items() if n in alone}, most=1),
+        *screen.choices([c for c in causes if c.name not in alone]),
+        *screen.choices([c for c in causes if c.name in alone], most=1),
     ]:
-        groups.setdefault(tuple(sorted(name for name, _ in choice.parts)), []).append(choice)
+        groups.setdefault(tuple(sorted(c.name for c, _ in choice.parts)), []).append(choice)
     hypotheses = {h.name: h for h in single}
     for names, group in groups.items():
-        h = joined(*(hypotheses[n] for n in names))
-        some = [causes[n] for n in names]
+        some = [cause for cause, _ in group[0].parts]
         relevant = sum(c.ln_relevant_in_set for c in some)
         relevant = some[0].ln_relevant if len(some) == 1 else relevant
-        chosen = [(c.ln_evidence, tuple((causes[n], i) for n, i in c.parts)) for c in group]
-        found.append(Candidate.of(h, odds, relevant, chosen))
+        found.append(Candidate.of(joined(*(hypotheses[n] for n in names)), odds, relevant, group))
     found = _restricted(found)
     found += _restricted(_with_residuals(screen, odds, found))
     least = max(c.promise for c in found) - CUT
     best = {c.name: c for c in sorted(found, key=lambda c: c.promise)}
-    return [c for c in found if c.promise > least or ("+" not in c.name and best[c.name] is c)]
+    shares = dict[str, float]()
+    for c in found:
+        shares[c.name] = shares.get(c.name, 0.0) + c.hypothesis.share
+    kept = [c for c in found if c.promise > least or ("+" not in c.name and best[c.name] is c)]
+    return kept, {c.name: shares[c.name] for c in kept}
 
 
 def _restricted(found: Sequence[Candidate]) -> list[Candidate]:
@@ -266,22 +268,18 @@ def _with_residuals(screen: Screen, odds: Odds, found: Sequence[Candidate]) -> l
     """Candidates near the best listed one, with something unlisted beside their causes."""
     listed = [c for c in found if c.name not in ("none", "unknown")]
     least = max((c.promise for c in listed), default=0.0) - CUT
-    residuals = [
-        screen.cause(h) for h in with_residual_discrepancy(screen.data, Hypothesis("none"))
-    ]
+    alone = with_residual_discrepancy(screen.data, Hypothesis("none"))
+    residuals = [screen.cause(h) for h in alone]
     more = []
     for c in sorted(listed, key=lambda c: -c.promise)[:BESIDE]:
         if c.promise < least:
             break
-        top = sorted(c.choices, key=lambda choice: -choice[0])[:PARTS]
-        for h, rest in zip(
-            with_residual_discrepancy(screen.data, c.hypothesis), residuals, strict=True
-        ):
-            for part in range(len(rest.parts)):
-                with_rest = [(*chosen, (rest, part)) for _, chosen in top]
-                values = [(screen.ln_evidence(chosen), chosen) for chosen in with_rest]
+        beside = with_residual_discrepancy(screen.data, c.hypothesis)
+        for h, rest in zip(beside, residuals, strict=True):
+            if rest.parts:
+                choices = [screen.choice((*top.parts, (rest, 0))) for top in c.best[:PARTS]]
                 relevant = c.ln_relevant + rest.ln_relevant_in_set
-                more.append(Candidate.of(h, odds, relevant, values))
+                more.append(Candidate.of(h, odds, relevant, choices))
     return more
 
 
@@ -335,11 +333,11 @@ def _scored(
 def _first_look(screen: Screen, c: Candidate, seed: int) -> tuple[Fit, list[Proposed], float]:
     """Draw a posterior from its best guesses."""
     forward = screen.forward(c.hypothesis)
-    top = sorted(c.choices, key=lambda choice: -choice[0])[:GUESSES]
-    found = [screen.guess(forward, chosen) for _, chosen in top]
+    top = c.best[:GUESSES]
+    found = [screen.guess(forward, choice.parts) for choice in top]
     guesses = [
-        (proposal, float(np.exp(value - top[0][0])))
-        for (proposal, _), (value, _) in zip(found, top, strict=True)
+        (proposal, float(np.exp(choice.ln_evidence - top[0].ln_evidence)))
+        for (proposal, _), choice in zip(found, top, strict=True)
     ]
     rng = _stream(c.hypothesis, seed, "first")
     fit, proposals = sample(forward, found[0][1], guesses, rng, FIRST, FIRST_ROUNDS)
@@ -349,7 +347,7 @@ def _first_look(screen: Screen, c: Candidate, seed: int) -> tuple[Fit, list[Prop
 def _score(screen: Screen, c: Candidate, fit: Fit, every: int) -> float:
     """Log evidence of the relevant prior, by every so manieth draw, times the share in its name."""
     score = fit.log_evidence + float(np.log(c.hypothesis.share))
-    if not c.choices[0][1]:  # nothing acts
+    if not c.choices[0].parts:  # nothing acts
         return score
     size = sizes(fit.forward, screen.noise, fit.sample[::every])
     return score + ln_relevant(size) - c.ln_restricted

@@ -36,7 +36,7 @@ from calib.gap.forward import Forward
 from calib.gap.hypotheses import Hypothesis
 from calib.gap.noise import Noise
 from calib.gap.odds import sizes
-from calib.gap.posterior import DOF, searched
+from calib.gap.posterior import DOF, as_normal, searched
 from calib.inference.mode import prior_widths
 from calib.inference.proposal import StudentT
 from calib.inference.random import generator
@@ -82,12 +82,21 @@ class Cause:
     ln_relevant: float
     ln_relevant_in_set: float
 
+    @property
+    def name(self) -> str:
+        """Of the hypothesis."""
+        return self.forward.hypothesis.name
+
+
+# A part of each of some causes, by its place.
+type Parts = tuple[tuple[Cause, int], ...]
+
 
 @dataclass(frozen=True)
 class Choice:
-    """One part of each cause of a set, by places, and the log evidence of the relevant prior."""
+    """One part of each cause of a set, and the log evidence of the relevant prior."""
 
-    parts: tuple[tuple[str, int], ...]
+    parts: Parts
     ln_evidence: float
 
 
@@ -109,7 +118,7 @@ class Screen:
         sds, field = problem.sds(noise), problem.field
         lab = np.setdiff1d(np.arange(sds.size), field)
         *_, lower, upper, _ = none.priors._arrays
-        loc, precision = _as_normal(none)
+        loc, precision = as_normal(none)
         mode = loc.copy()
         for name, t in lab_mode.items():
             mode[none.theta_slices[name]] = t
@@ -121,7 +130,7 @@ class Screen:
         pull = slope[:, lab] @ raw[0, lab] + precision**2 * (loc - mode)
         moved = np.linalg.solve(self._precision, pull)
         self.shared, self.start = np.clip(mode + moved, lower, upper), mode
-        self._slope, self._field_sds, self._lower = slope[:, field], sds[field], lower
+        self._slope, self._field_sds = slope[:, field], sds[field]
         self._left = raw[0, field] - self._slope.T @ (self.shared - mode)
         variance = np.eye(field.size) + self._slope.T @ np.linalg.solve(
             self._precision, self._slope
@@ -163,8 +172,8 @@ class Screen:
             forward, parts, ln_share(known & (size >= MIN_EFFECT_SIZE)), ln_share(relevant)
         )
 
-    def ln_evidence(self, chosen: Sequence[tuple[Cause, int]]) -> float:
-        """Log density of the white rows, but for a constant, with a part of each cause."""
+    def choice(self, chosen: Parts) -> Choice:
+        """Evaluate the log density of the white rows, but for a constant."""
         parts = [cause.parts[i] for cause, i in chosen]
         left = self.rows - sum(p.mean for p in parts)
         root = np.concatenate([np.empty((left.size, 0)), *(p.root for p in parts)], axis=1)
@@ -174,23 +183,21 @@ class Screen:
         squares = float(left @ left - white @ white)
         ln_share = sum(p.ln_share for p in parts)
         tail = float(self.ln_tail(np.array(squares)))
-        return tail + ln_share - float(np.log(np.diag(lower)).sum())
+        return Choice(chosen, tail + ln_share - float(np.log(np.diag(lower)).sum()))
 
     def ln_tail(self, squares: Array) -> Array:
         """Student's t: the noise's scale is as uncertain as the laboratory leaves it."""
         power = 0.5 * (self.dof + self.rows.size)
         return np.asarray(-power * np.log1p(np.maximum(squares, 0.0) / self.dof))
 
-    def choices(self, causes: Mapping[str, Cause], most: int = MOST_CAUSES) -> list[Choice]:
+    def choices(self, causes: Sequence[Cause], most: int = MOST_CAUSES) -> list[Choice]:
         """Evaluate choices of parts for up to four causes: all single ones and pairs.
 
         Of larger sets those that enlarge one of the `BEAM` best choices of one cause less.
         """
-        return _Beam(self, causes).run(most) if any(c.parts for c in causes.values()) else []
+        return _Beam(self, causes).run(most) if any(c.parts for c in causes) else []
 
-    def guess(
-        self, forward: Forward, chosen: Sequence[tuple[Cause, int]]
-    ) -> tuple[StudentT, dict[str, Noise]]:
+    def guess(self, forward: Forward, chosen: Parts) -> tuple[StudentT, dict[str, Noise]]:
         """Condition what is searched of a hypothesis on the rows, given a part of each cause.
 
         Returns
@@ -230,7 +237,7 @@ class Screen:
         problem, d = Residuals(self.data, forward), forward.n_dim
         rng = generator(self.seed, "gap", "guess", forward.hypothesis.name)
         *_, lower, upper, _ = forward.priors._arrays
-        loc, precision = _as_normal(forward)
+        loc, precision = as_normal(forward)
         noise = dict(self.noise)
         for _ in range(STEPS):
             root = _root(covariance)
@@ -264,15 +271,6 @@ def _root(covariance: Array) -> Array:
     sd = np.sqrt(np.diag(covariance)) + 1e-300
     alike = covariance / np.outer(sd, sd)
     return sd[:, None] * np.linalg.cholesky(0.5 * (alike + alike.T) + 1e-8 * np.eye(sd.size))
-
-
-def _as_normal(forward: Forward) -> tuple[Array, Array]:
-    """Means and inverse sds of the priors, uniform ones as normal as well."""
-    loc, _, lower, upper, precision = forward.priors._arrays
-    normal = precision > 0.0
-    with np.errstate(invalid="ignore"):
-        middle, width = 0.5 * (lower + upper), np.sqrt(12.0) / (upper - lower)
-    return np.where(normal, loc, middle), np.where(normal, precision, width)
 
 
 def _parts(white: Array, psi: Array, split: bool, rng: np.random.Generator) -> tuple[Part, ...]:
@@ -330,12 +328,11 @@ def places(old: Forward, new: Forward) -> tuple[Array, Array]:
 class _Beam:
     """Choices of parts, enlarged by one cause after the other."""
 
-    def __init__(self, screen: Screen, causes: Mapping[str, Cause]) -> None:
+    def __init__(self, screen: Screen, causes: Sequence[Cause]) -> None:
         self._screen = screen
-        self._names = list(causes)
-        every = [(j, i, p) for j, c in enumerate(causes.values()) for i, p in enumerate(c.parts)]
+        every = [(j, i, p) for j, c in enumerate(causes) for i, p in enumerate(c.parts)]
         self._of = np.array([j for j, _, _ in every])
-        self._labels = [(self._names[j], i) for j, i, _ in every]
+        self._labels = [(causes[j], i) for j, i, _ in every]
         self._ln_share = np.array([p.ln_share for _, _, p in every])
         roots = np.zeros((len(every), RANK, screen.rows.size))
         for root, (_, _, p) in zip(roots, every, strict=True):

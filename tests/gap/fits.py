@@ -47,12 +47,12 @@ def fitted(
     """Return a posterior from the guesses of the screen."""
     screen = Screen(data, *calibrate_lab(data, seed), seed)
     forward = screen.forward(hypothesis)
-    choices = [[]]
+    choices = [screen.choice(())]
     if forward.causes:
         cause = screen.cause(hypothesis)
-        choices = [[(cause, i)] for i in range(len(cause.parts))]
-    best = sorted(choices, key=lambda c: -screen.ln_evidence(c))[:3]
-    guesses = [screen.guess(forward, c) for c in best]
+        choices = [screen.choice(((cause, i),)) for i in range(len(cause.parts))]
+    best = sorted(choices, key=lambda c: -c.ln_evidence)[:3]
+    guesses = [screen.guess(forward, c.parts) for c in best]
     rng, (_, noise) = np.random.default_rng(seed), guesses[0]
     begun = [(proposal, 1.0) for proposal, _ in guesses]
     first, found = sample(forward, noise, begun, rng, 200.0, (1000,) * 6)

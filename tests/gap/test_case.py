@@ -209,7 +209,11 @@ def test_the_soil_sets_how_probable_a_shift_is_unless_that_is_said(same, p):
         assert given.ln_prior(name) == plain.ln_prior(name)
     said = Context(same_soil=same, suspected={"parameter_shift": 0.3})
     assert said.suspected == {"parameter_shift": 0.3}
-    assert Context(same_soil=same).words()[1] == f"parameter shift suspected ({p:g})"
+    soil = "the same soil" if same else "another soil"
+    assert Context(same_soil=same).words() == [
+        f"{soil} (prior probability of a parameter shift {p:g})"
+    ]
+    assert said.words() == [soil, "parameter shift suspected (0.3)"]
 
 
 def test_shifts_are_weighed_anew_for_the_same_soil(fake_ranking):
@@ -635,3 +639,14 @@ def test_effects_of_ones_own_are_recorded_and_not_resumed_without_them(diagnosed
     (out / "case-0" / INPUTS).write_bytes(record)
     with pytest.raises(CalibError, match="made with effects of one's own"):
         check_resumable([case], out, 1)
+
+
+def test_a_known_size_that_the_data_rule_out_stays_what_is_known():
+    """The guess, drawn to the readings, lies where the priors of the simulator have an end."""
+    context = Context(sizes={"force_offset": {"offset": Size(mean=20.0, sd=0.01)}})
+    case = replace(make_case(None, models=PULL_ONLY), context=context)
+    ranking = diagnose_once(case, 1, effects=CHOICE).ranking
+    (found,) = ranking.fits["force_offset"]
+    assert np.isfinite(found.log_evidence)
+    assert ranking.probability["force_offset"] < 1e-6
+    assert found.psi[found.forward.phi_slices[0]] == pytest.approx(20.0, abs=0.05)

@@ -283,12 +283,15 @@ def test_prior_and_evidence_give_the_probabilities():
     odds = {
         name: (
             ranking.prior[name] * np.exp(value - max(ranking.log_evidence.values()))
-            / min(sum(f.forward.hypothesis.share for f in ranking.fits[name]), 1.0)
+            / ranking.shares[name]
         ) ** (1.0 / coarse)
         for name, value in ranking.log_evidence.items()
     }  # fmt: skip
     total = sum(odds.values())
     assert {n: v / total for n, v in odds.items()} == pytest.approx(ranking.probability)
+    # Variants that the screen gave up are a part of what a name could have been.
+    for name in ("none", "unknown", "parameter_shift", "lug_thrust"):
+        assert ranking.shares[name] == pytest.approx(1.0)
     assert ranking.prior["lug_thrust"] == pytest.approx(ranking.prior["force_offset"])
     assert ranking.prior["lug_thrust"] > ranking.prior["force_offset+lug_thrust"] > 0.0
 
