@@ -284,8 +284,8 @@ def _converged(ranking: Ranking) -> tuple[Remark, ...]:
     said = f"the sampler did not converge: too few effective draws of {', '.join(few)}"
     return (
         Remark(
-            f"{said}, fewer than {FEWEST_DRAWS:.0f}; probabilities may be off by more than 0.05: "
-            "give tighter priors, or more rows",
+            f"{said}, where {FEWEST_DRAWS:.0f} are needed; its probability may be off by more than "
+            "0.05: use tighter priors or more rows",
             said,
         ),
     )

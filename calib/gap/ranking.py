@@ -68,7 +68,8 @@ class Ranking:
     scores : mapping of str to tuple of float
         Log evidence of each fit, for effects that matter, times its share in its hypothesis.
     shares : mapping of str to float
-        How probable all variants of a name were beforehand, of what is usual for such a name.
+        Prior probability of all variants of a name together, as a part of what a name of its kind
+        has.
     probability : mapping of str to float
         Sums to one.
     not_testable : mapping of str to str
@@ -345,7 +346,7 @@ def _first_look(screen: Screen, c: Candidate, seed: int) -> tuple[Fit, list[Prop
 
 
 def _score(screen: Screen, c: Candidate, fit: Fit, every: int) -> float:
-    """Log evidence of the relevant prior, by every so manieth draw, times the share in its name."""
+    """Log evidence of the relevant prior times the share in its name; sizes of every n-th draw."""
     score = fit.log_evidence + float(np.log(c.hypothesis.share))
     if not c.choices[0].parts:  # nothing acts
         return score
