@@ -18,7 +18,14 @@ from calib.errors import CalibError
 from calib.gap.case import Case
 from calib.gap.constants import ASSUMED_LOAD_KN, MAX_RATIO, MIN_FIELD_ROWS
 from calib.gap.effects import View
-from calib.gap.noise import Noise, NoiseConditions, noise_conditions, noise_conditions_of_lab
+from calib.gap.noise import (
+    Along,
+    Noise,
+    NoiseConditions,
+    Whitening,
+    noise_conditions,
+    noise_conditions_of_lab,
+)
 from calib.inference.priors import Priors
 from calib.inference.problem import Problem, build_problem
 from calib.models import MODELS, get_model
@@ -203,6 +210,8 @@ class OutputData:
         Field rows that have the output.
     field : ndarray
         Their outputs on the scale of the response.
+    along : Along, optional
+        If the noise is correlated along runs.
     """
 
     name: str
@@ -210,6 +219,7 @@ class OutputData:
     priors: Priors
     rows: NDArray[np.int64]
     field: Array
+    along: Along | None = None
 
     @cached_property
     def role(self) -> str:
@@ -282,7 +292,16 @@ class Campaigns:
     def at_rows(self) -> dict[str, NoiseConditions]:
         """What the noise of every output's lab rows, then field rows, depends on."""
         field = noise_conditions(self.view)
-        return {o.name: self.lab_at[o.name] + field.rows(o.rows) for o in self.outputs}
+        return {
+            o.name: replace(self.lab_at[o.name] + field.rows(o.rows), along=o.along)
+            for o in self.outputs
+        }
+
+    def whitenings(self, o: OutputData, noise: Noise) -> tuple[Whitening, Whitening]:
+        """Return what makes an output's residuals independent, in the lab and in the field."""
+        both, n_lab = Whitening.of(noise, self.at_rows[o.name]), o.problem.response.size
+        every = np.arange(both.sd.size)
+        return both.take(every[:n_lab]), both.take(every[n_lab:])
 
     @cached_property
     def observed(self) -> Array:
@@ -386,12 +405,14 @@ def _output(case: Case, name: str, model: str) -> OutputData:
         table.must_have(*get_model(model).conditions)
     lab = case.lab.take(np.isfinite(case.lab[column]))
     problem = build_problem(model, lab, case.priors.get(name))
-    problem.noise.must_be_iid_normal(problem.priors.source, "a diagnosis")
+    problem.noise.must_be_normal_of_one_sd(problem.priors.source)
     rows = np.flatnonzero(np.isfinite(case.field[column]))
     _check_field(case, name, column, rows)
     response = problem.bound.to_response(case.field[column][rows])
-    # The noise scale is not a parameter of the simulator: it is inferred beside it.
-    return OutputData(name, problem, Priors(problem.priors.entries[:-1]), rows, response)
+    # What the noise has is not a parameter of the simulator: it is inferred beside it.
+    own = len(problem.priors.entries) - 1 - len(problem.noise.parameters)
+    priors, along = Priors(problem.priors.entries[:own]), Along.of(problem, case.field.take(rows))
+    return OutputData(name, problem, priors, rows, response, along)
 
 
 def _check_field(case: Case, name: str, column: str, rows: NDArray[np.int64]) -> None:

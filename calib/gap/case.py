@@ -363,7 +363,7 @@ def case_from_run(run: Path, field: Path) -> Case:
     """
     # Needs what writes and reads run folders, and that a sampler: no other case does.
     problem = import_module("calib.inference.io").load_calibration(run).problem
-    problem.noise.must_be_iid_normal(str(Path(run) / "priors.toml"), "a diagnosis")
+    problem.noise.must_be_normal_of_one_sd(str(Path(run) / "priors.toml"))
     model = problem.bound.model
     output = output_of(model.output)
     table = read_table(field, allow_missing=tuple(OUTPUTS.values()))

@@ -35,6 +35,7 @@ RHO = np.array([0.0, 1.0, 2.5, 5.0])  # 1
 LN_RHO_PRIOR = np.log(np.array([0.5, 0.2, 0.15, 0.15]))  # most noise is even
 KAPPA = np.array([0.0, 0.8, -0.8])  # 1; He et al.'s pull is twice as noisy at 18 as at 42 psi
 LN_KAPPA_PRIOR = np.log(np.array([0.7, 0.2, 0.1]))
+CORRELATIONS = 9  # correlations of neighbours, equally probable; if asked for; test_correlated
 
 # Prior probabilities of hypotheses; test_hypotheses, test_ranking.
 PRIOR = {"none": 0.40, "unknown": 0.12, "parameter_shift": 0.12, "single": 0.36}  # of the kinds

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -153,9 +153,7 @@ def _fit_document(fit: Fit, probability: float) -> dict[str, Any]:
         "probability": probability,
         "sample": _short(fit.sample),
         "field": {o: _short([values])[0] for o, values in _field(fit).items()},
-        "noise": {
-            o: {"sigma": n.sigma, "rho": n.rho, "kappa": n.kappa} for o, n in fit.noise.items()
-        },
+        "noise": {o: asdict(n) for o, n in fit.noise.items()},
     }
 
 
@@ -250,7 +248,7 @@ def _load_fit(
         document["smooth_decay"],
         document["onset_over"],
     )
-    noise = {o: Noise(n["sigma"], n["rho"], n["kappa"]) for o, n in document["noise"].items()}
+    noise = {o: Noise(**n) for o, n in document["noise"].items()}
     # What the coordinates of a shift mean is the file's, whatever the priors shipped now say.
     shift = _load_shift(document["shift_map"])
     sigma = {o: n.sigma for o, n in noise.items()}

@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.gap.campaigns import Campaigns
 from calib.gap.forward import Forward
-from calib.gap.noise import Noise, ln_averaged, most_probable
+from calib.gap.noise import Noise, Whitening, ln_averaged, most_probable
 from calib.models.base import Array
 
 
@@ -110,14 +110,21 @@ class Residuals:
         """Noise sd of every row, shape (N,)."""
         return np.concatenate([noise[o].sd(at) for o, at in self.data.at_rows.items()])
 
+    def whitening(self, noise: Mapping[str, Noise]) -> Whitening:
+        """Return what makes the residuals of all rows independent standard normals."""
+        return Whitening.joined([Whitening.of(noise[o], at) for o, at in self.data.at_rows.items()])
+
+    def products(self, one: Array, other: Array) -> dict[str, Array]:
+        """Products of residuals (..., N) of each output, as its noise needs them."""
+        at = self.data.at_rows
+        return {o: at[o].products(one[..., p], other[..., p]) for o, p in self.parts.items()}
+
     def ln_averaged(self, raw: Array) -> Array:
         """Log likelihood, averaged over the noise of each output, shape (m, N) to (m,)."""
         at = self.data.at_rows
-        return np.sum(
-            [ln_averaged(np.square(raw[:, part]), at[o]) for o, part in self.parts.items()], axis=0
-        )
+        return np.sum([ln_averaged(p, at[o]) for o, p in self.products(raw, raw).items()], axis=0)
 
-    def noise_of(self, squared: Array) -> dict[str, Noise]:
-        """Most probable noise, by the mean squares of residuals, shape (N,)."""
+    def noise_of(self, products: Mapping[str, Array]) -> dict[str, Noise]:
+        """Most probable noise, by the mean products of residuals of each output."""
         at = self.data.at_rows
-        return {o: most_probable(squared[None, part], at[o])[0] for o, part in self.parts.items()}
+        return {o: most_probable(p[None], at[o])[0] for o, p in products.items()}

@@ -163,23 +163,25 @@ def _signatures(
 def _metric_root(
     data: Campaigns, lab_mode: Mapping[str, Array], noise: Mapping[str, Noise]
 ) -> Array:
-    """A root R of C^-1 (R'R = C^-1), block by output, shape (N, N)."""
+    """A root R of C^-1 (R'R = C^-1) for changes in noise sds, block by output, shape (N, N)."""
     blocks = []
     for o in data.outputs:
-        sigma = noise[o.name].sigma
-        scale = o.problem.priors.entries[-1]
-        mode = np.append(lab_mode[o.name], np.log(sigma) if scale.log else sigma)
+        own, found, mode = len(o.priors.free), noise[o.name], lab_mode[o.name]
+        of_noise = [found.sigma] if o.along is None else [found.correlation, found.sigma]
+        natural = np.append(o.priors.to_natural(mode[None]), of_noise)
+        at = np.append(mode, o.problem.priors.to_internal(natural[None])[0, own:])
         width = prior_widths(o.problem.priors)
-        covariance = hessian_scale(o.problem.log_prob, mode, width)[:-1, :-1]
-        step = 1e-4 * width[:-1]
+        covariance = hessian_scale(o.problem.log_prob, at, width)[:own, :own]
+        step = 1e-4 * width[:own]
         points = lab_mode[o.name] + np.concatenate([np.diag(step), -np.diag(step)])
         conditions = o.problem.bound.model.select(data.view.conditions)
         mean = o.problem.bound.mean_response(o.priors.to_natural(points), conditions)[:, o.rows]
         change = (mean[: step.size] - mean[step.size :]) / (2.0 * step[:, None])
-        sd = noise[o.name].sd(noise_conditions(data.view).rows(o.rows))
-        sensitivity = (np.nan_to_num(change) / sd).T
+        _, white = data.whitenings(o, found)
+        sensitivity = white(np.nan_to_num(change)).T
         c = np.eye(o.rows.size) + sensitivity @ covariance @ sensitivity.T
-        blocks.append(np.linalg.inv(np.linalg.cholesky(c)))
+        own_noise = white.decorrelated(np.eye(o.rows.size)).T
+        blocks.append(np.linalg.solve(np.linalg.cholesky(c), own_noise))
     return np.asarray(block_diag(*blocks))
 
 

@@ -34,7 +34,14 @@ from calib.gap.fit import Fit
 from calib.gap.ranking import Ranking
 from calib.models import get_model
 from calib.models.base import Array
-from calib.validation.residuals import Check, Remark, failed, unexplained, unused
+from calib.validation.residuals import (
+    Check,
+    Remark,
+    autocorrelated,
+    failed,
+    unexplained,
+    unused,
+)
 
 # Factors between units that are taken for one another, with one that a quantity has to have, and
 # how near a ratio has to come (sd of a logarithm); conditions are other ones in every campaign, so
@@ -266,6 +273,7 @@ def doubts(data: Campaigns, ranking: Ranking) -> tuple[Remark, ...]:
             for check in (
                 *_noisier(data, o, ranking.lab_mode[o.name], best),
                 *_patterns(data, o, ranking, best),
+                *_dependent(data, o, ranking.lab_mode[o.name], best),
             )
         ]
     )
@@ -300,13 +308,10 @@ def _noisier(data: Campaigns, o: OutputData, mode: Array, best: Fit) -> Iterable
     noise, left = best.noise[o.name], o.problem.response.size - len(o.priors.free)
     if left < 1:
         return
-    lab = (
-        o.problem.response
-        - o.problem.bound.mean_response(o.priors.to_natural(mode[None]), o.problem.conditions)[0]
-    )
-    field = best.field_residuals[o.name] * noise.sigma
-    grown = data.lab_at[o.name].growth(noise.rho, noise.kappa)
-    variance = float(np.square(lab / grown).sum()) / left
+    lab = _lab_residuals(o, mode)
+    of_lab, of_field = data.whitenings(o, noise)
+    field = of_field.decorrelated(best.field_residuals[o.name])
+    variance = float(np.square(of_lab(lab)).sum()) / left
     if not variance > 0.0:
         return
     f = float(np.square(field).mean()) / variance
@@ -341,10 +346,35 @@ def _patterns(data: Campaigns, o: OutputData, ranking: Ranking, best: Fit) -> It
     return unexplained(
         table,
         columns,
-        best.field_residuals[o.name],
+        data.whitenings(o, best.noise[o.name])[1].decorrelated(best.field_residuals[o.name]),
         title=f"the field's {output} differs with {{!r}}, which no model or effect uses",
         hint="declare it under [covariates] in case.toml, and diagnose again",
     )
+
+
+def _lab_residuals(o: OutputData, mode: Array) -> Array:
+    natural = o.priors.to_natural(mode[None])
+    predicted = o.problem.bound.mean_response(natural, o.problem.conditions)[0]
+    return np.asarray(o.problem.response - predicted)
+
+
+def _dependent(data: Campaigns, o: OutputData, mode: Array, best: Fit) -> Iterator[Check]:
+    """Whether neighbours along the runs of either campaign are alike.
+
+    What the explanation takes up is not allowed for, so that it is too rarely significant.
+    """
+    if o.along is not None:
+        return
+    field = data.case.field.take(o.rows)
+    both = (o.problem.table, _lab_residuals(o, mode)), (field, best.field_residuals[o.name])
+    for table, residual in both:
+        place = next((table[c] for c in columns_of("order") if c in table), None)
+        if place is None or not np.ptp(residual) > 0.0:
+            continue
+        run = table["run"] if "run" in table else np.zeros(place.size)
+        yield from autocorrelated(
+            table, residual[np.lexsort((place, run))], np.empty((residual.size, 0))
+        )
 
 
 def _noise_text(o: OutputData, sd: float) -> str:

@@ -69,7 +69,8 @@ class Density:
     def __init__(self, forward: Forward, noise: Mapping[str, Noise]) -> None:
         self._forward = forward
         self.problem = Residuals(forward.data, forward)
-        self._sds = self.problem.sds(noise)
+        self._noise = self.problem.whitening(noise)
+        self._field_noise = self._noise.take(self.problem.field)
         every = np.arange(forward.n_dim)
         self._integrated = every[_integrated(forward)]
         _, scale, *_ = forward.priors._arrays
@@ -109,7 +110,7 @@ class Density:
         full = acting.at(psi)
         ln_q: Array | float = 0.0
         if self._forms.size:
-            left = self.problem.beside(lab, full)[:, self.problem.field] / self._field_sds
+            left = self._field_noise(self.problem.beside(lab, full)[:, self.problem.field])
             psi[:, self._forms], ln_q = self._forms_given(
                 self._white(left), self._form_basis(psi, acting, full), rng
             )
@@ -120,7 +121,7 @@ class Density:
         """Log likelihood plus log prior, what can be integrated out, by residuals (k, N)."""
         total = self._forward.log_prior(psi)
         if self._integrated.size:
-            left = raw / self._sds
+            left = self._noise(raw)
             left[:, self.problem.field] = self._white(left[:, self.problem.field])
             total = total - 0.5 * np.square(left).sum(axis=1) + self._constant
         else:
@@ -142,9 +143,8 @@ class Density:
                 change = np.nan_to_num((full[o.name] - without[o.name])[:, o.rows])
                 at = slice(*np.searchsorted(self._forms, (part.start, part.stop)))
                 if part.stop > part.start:
-                    change /= self._field_sds[rows]
                     np.multiply(change[:, None], basis[o.rows].T, out=found[:, at, rows])
-        return self._white(found)
+        return self._white(self._field_noise(found))
 
     def _forms_given(
         self, left: Array, basis: Array, rng: np.random.Generator
@@ -178,28 +178,28 @@ class Density:
         if not self._integrated.size:
             return psi, raw, np.zeros(len(psi))  # averaged already
         root = np.linalg.cholesky(self._basis @ self._basis.T + np.diag(self._prior_sd**-2.0))
-        left = (raw / self._sds)[:, self.problem.field]
+        left = self._field_noise(raw[:, self.problem.field])
         white = np.linalg.solve(root, self._basis @ left.T)
         drawn = np.linalg.solve(root.T, white + rng.standard_normal(white.shape)).T
         psi[:, self._integrated] = drawn
-        raw[:, self.problem.field] -= drawn @ self._basis * self._field_sds
-        at_noise = -0.5 * np.square(raw / self._sds).sum(axis=1) - np.log(self._sds).sum()
-        at_noise -= 0.5 * self._sds.size * _LN_2_PI
+        raw[:, self.problem.field] -= drawn @ self._shapes
+        at_noise = -0.5 * np.square(self._noise(raw)).sum(axis=1) - self._noise.ln_scale
+        at_noise -= 0.5 * raw.shape[1] * _LN_2_PI
         return psi, raw, self.problem.ln_averaged(raw) - at_noise
 
     @cached_property
-    def _field_sds(self) -> Array:
-        """Of the noise of the field's rows."""
-        return np.asarray(self._sds[self.problem.field])
+    def _shapes(self) -> Array:
+        """What is integrated out does at the field's rows, (m, n)."""
+        return self.problem.linear_jacobian(np.zeros(self._forward.n_dim))
 
     @cached_property
     def _basis(self) -> Array:
-        """Shapes of what is integrated out, over the sds of the field's rows, (m, n)."""
-        return self.problem.linear_jacobian(np.zeros(self._forward.n_dim)) / self._field_sds
+        """The same with the noise made white."""
+        return self._field_noise(self._shapes)
 
     @cached_property
     def _root(self) -> Array:
-        """Of the covariance of the field's rows over their sds, shape (n, n)."""
+        """Of the covariance of the field's rows, their noise made white, shape (n, n)."""
         scaled = self._basis * self._prior_sd[:, None]
         return np.asarray(np.linalg.cholesky(np.eye(scaled.shape[1]) + scaled.T @ scaled))
 
@@ -208,12 +208,12 @@ class Density:
         return np.asarray(np.linalg.inv(self._root).T)
 
     def _white(self, left: Array) -> Array:
-        """Residuals of the field's rows over their sds made independent, shape (..., n)."""
+        """Residuals of the field's rows, their noise white, made independent, shape (..., n)."""
         return np.asarray(left @ self._whitening if self._integrated.size else left)
 
     @cached_property
     def _constant(self) -> float:
-        total = -0.5 * self._sds.size * _LN_2_PI - float(np.log(self._sds).sum())
+        total = -0.5 * self._noise.sd.size * _LN_2_PI - self._noise.ln_scale
         total -= float(np.log(np.diag(self._root)).sum())
         # The prior has the density of coefficients of zero in it, which are integrated out.
         return total + float((np.log(self._prior_sd) + 0.5 * _LN_2_PI).sum())
@@ -276,7 +276,8 @@ def sample(
     known = np.isfinite(raw).all(axis=1)
     raw = raw[known] if known.any() else np.ones_like(raw)
     # The mean square over the posterior is not too small for what parameters have taken up.
-    found = density.problem.noise_of(np.square(raw).mean(axis=0))
+    products = density.problem.products(raw, raw)
+    found = density.problem.noise_of({o: p.mean(axis=0) for o, p in products.items()})
     standardised = (raw.mean(axis=0) / density.problem.sds(found))[density.problem.field]
     ends = np.cumsum([o.rows.size for o in forward.data.outputs])[:-1]
     left = dict(zip(forward.data.names, np.split(standardised, ends), strict=True))

@@ -365,9 +365,10 @@ def calibrate_lab(data: Campaigns, seed: int) -> Lab:
     for o in data.outputs:
         _check_defined(data, o, generator(seed, "gap", "defined", o.name))
         mode = find_mode(o.problem.log_prob, o.problem.priors)
-        modes[o.name] = mode[:-1]
-        sigma = float(o.problem.theta(mode[None])[0, -1])
-        noise[o.name] = Noise(sigma, 0.0)
+        modes[o.name] = mode[: len(o.priors.free)]
+        natural = o.problem.theta(mode[None])
+        along = o.problem.noise.own("rho", natural)[0, 0] if o.along is not None else 0.0
+        noise[o.name] = Noise(float(natural[0, -1]), correlation=float(along))
     return modes, noise
 
 

@@ -115,8 +115,8 @@ class Screen:
         self.data, self.lab_mode, self.noise, self.seed = data, lab_mode, noise, seed
         none = self.forward(Hypothesis("none"))
         problem = Residuals(data, none)
-        sds, field = problem.sds(noise), problem.field
-        lab = np.setdiff1d(np.arange(sds.size), field)
+        white, field = problem.whitening(noise), problem.field
+        lab = np.setdiff1d(np.arange(white.sd.size), field)
         *_, lower, upper, _ = none.priors._arrays
         loc, precision = as_normal(none)
         mode = loc.copy()
@@ -124,13 +124,13 @@ class Screen:
             mode[none.theta_slices[name]] = t
         step = 1e-4 * prior_widths(none.priors)
         step = np.where(mode + step > upper, -step, step)
-        raw = problem.raw(np.concatenate([mode[None], mode + np.diag(step)])) / sds
+        raw = white(problem.raw(np.concatenate([mode[None], mode + np.diag(step)])))
         slope = np.nan_to_num((raw[0] - raw[1:]) / step[:, None])
         self._precision = slope[:, lab] @ slope[:, lab].T + np.diag(precision**2)
         pull = slope[:, lab] @ raw[0, lab] + precision**2 * (loc - mode)
         moved = np.linalg.solve(self._precision, pull)
         self.shared, self.start = np.clip(mode + moved, lower, upper), mode
-        self._slope, self._field_sds = slope[:, field], sds[field]
+        self._slope, self._field_noise = slope[:, field], white.take(field)
         self._left = raw[0, field] - self._slope.T @ (self.shared - mode)
         variance = np.eye(field.size) + self._slope.T @ np.linalg.solve(
             self._precision, self._slope
@@ -155,12 +155,12 @@ class Screen:
         psi = forward.prior_draws(rng, PRIOR_DRAWS)
         psi[:, : forward.n_shared] = self.start
         full, plain = forward.field_and_plain(psi, self.data.view)
-        does = self._problem.of_field({o: full[o] - plain[o] for o in full}) / self._field_sds
+        does = self._field_noise(self._problem.of_field({o: full[o] - plain[o] for o in full}))
         size = sizes(forward, self.noise, psi)[:, 0]
         known = np.isfinite(does).all(axis=1)
         relevant = known & (size >= MIN_EFFECT_SIZE_IN_PAIR)
 
-        def ln_share(large: Array) -> float:
+        def ln_share(large: NDArray[np.bool_]) -> float:
             return float(np.log((large.sum() + 0.5) / (known.sum() + 1.0)))
 
         parts: tuple[Part, ...] = ()
@@ -243,8 +243,8 @@ class Screen:
             root = _root(covariance)
             psi = mean + rng.standard_normal((12 * d, d)) @ root.T
             psi = np.clip(psi, lower, upper)
-            sds = problem.sds(noise)
-            raw = problem.raw(psi) / sds
+            white = problem.whitening(noise)
+            raw = problem.raw(psi) / white.sd
             known = np.isfinite(raw).all(axis=1)
             if known.sum() < 3 * d:
                 break
@@ -253,16 +253,20 @@ class Screen:
             away = (psi - centre) / width
             slope = np.linalg.lstsq(away, raw - left, rcond=1e-8)[0]
             # What is not linear about the rows counts as noise.
-            variance = 1.0 + np.square(raw - left - away @ slope).mean(axis=0)
-            slope /= width[:, None]
+            curved = white.decorrelated(raw - left - away @ slope)
+            variance = 1.0 + np.square(curved).mean(axis=0)
+            of_row = slope / width[:, None]
+            slope, distance = white.decorrelated(of_row), white.decorrelated(left)
             per_sd = slope / precision[:, None]  # of the prior: well conditioned
             inner = np.eye(d) + (per_sd / variance) @ per_sd.T
             covariance = np.linalg.inv(inner) / np.outer(precision, precision)
-            pull = precision**2 * (loc - centre) - (slope / variance) @ left
+            pull = precision**2 * (loc - centre) - (slope / variance) @ distance
             mean = np.clip(centre + covariance @ pull, lower, upper)
-            squared = np.square(left + (mean - centre) @ slope)
-            squared += (slope * (covariance @ slope)).sum(axis=0)
-            noise = problem.noise_of(squared * sds**2)
+            there, of_row = (left + (mean - centre) @ of_row) * white.sd, of_row * white.sd
+            about = problem.products(of_row, covariance @ of_row)
+            noise = problem.noise_of(
+                {o: p + about[o].sum(axis=0) for o, p in problem.products(there, there).items()}
+            )
         return mean, covariance, noise
 
 

@@ -189,6 +189,10 @@ class Noise:
                 hint="take this table out, and fit again what was fitted with it",
             )
 
+    def must_be_normal_of_one_sd(self, source: str) -> None:
+        """Raise a CalibError unless it is, for a diagnosis, whatever it is correlated along."""
+        replace(self, correlated_along="").must_be_iid_normal(source, "a diagnosis")
+
     def scale(self, natural: Array, conditions: Mapping[str, Array]) -> Array:
         """Return the scale at conditions: natural parameters (k, d_all) to (k, 1) or (k, n)."""
         sigma = natural[:, -1:]
@@ -293,6 +297,20 @@ class Serial:
 
     order: NDArray[np.intp]
     gap: Array
+
+    def __add__(self, other: Serial) -> Serial:
+        """These rows, then others, of other runs."""
+        return Serial(
+            np.concatenate([self.order, self.order.size + other.order]),
+            np.concatenate([self.gap, other.gap]),
+        )
+
+    @property
+    def before_each(self) -> NDArray[np.intp]:
+        """Place of the row before each, in the rows' order; of the first of a run, any."""
+        before = np.empty_like(self.order)
+        before[self.order] = np.where(np.isinf(self.gap), self.order, np.roll(self.order, 1))
+        return before
 
     def before(self, z: Array, rho: Array) -> tuple[Array, Array]:
         """Mean and variance of each row given those before it, (k, n), in the rows' order.

@@ -133,7 +133,7 @@ def residual_checks(problem: Problem, t: Array) -> tuple[Check, ...]:
     studentised = np.where(judged, score / np.sqrt(np.where(judged, 1.0 - leverage, 1.0)), np.nan)
     return (
         *unexplained(problem.table, _unused(problem), studentised),
-        *(() if problem.serial is not None else _autocorrelated(problem.table, score, design)),
+        *(() if problem.serial is not None else autocorrelated(problem.table, score, design)),
         *_uneven(problem, studentised),
         *_heavy_tailed(problem, studentised[judged]),
     )
@@ -228,8 +228,11 @@ def _numbers(cells: NDArray[np.str_] | Array) -> Array:
         return np.full(cells.size, np.nan)
 
 
-def _autocorrelated(table: Table, residual: Array, design: Array) -> Iterator[Check]:
-    """Durbin and Watson's (1951) test in the order of the file, by their beta approximation."""
+def autocorrelated(table: Table, residual: Array, design: Array) -> Iterator[Check]:
+    """Durbin and Watson's (1951) test in the order of the rows, by their beta approximation.
+
+    Of residuals (n,); the columns of the design, shape (n, k), are what was fitted.
+    """
     n = residual.size
     d = float(np.square(np.diff(residual)).sum() / np.square(residual).sum())
     mean, variance = durbin_watson_moments(design)
