@@ -173,7 +173,7 @@ def predict(
         )
     from calib import load_calibration
     from calib.data import read_for_model
-    from calib.data.checks import beyond_notes, check_conditions
+    from calib.data.checks import check_conditions
     from calib.models.simulators.emulator import emulator_of
     from calib.report.comparison import load_stack, verdicts_of
     from calib.validation.constants import MIN_DEFINED
@@ -207,12 +207,7 @@ def predict(
     columns = prediction_columns(prediction, table)
     if not converged:
         columns["converged"] = ["no"] * len(table)
-    outside = sum(bool(flags) for flags in prediction.outside)
-    if outside:
-        lie = "row lies" if outside == 1 else "rows lie"
-        beyond = f"{outside} {lie} outside the calibrated range, where the prediction is not"
-        for note in (f"{beyond} to be trusted", *beyond_notes(table, known)):
-            print(f"warning: {note}", file=sys.stderr)
+    outside = _say_outside(table, known, prediction.outside)
     undefined = int((prediction.defined < MIN_DEFINED).sum())
     if undefined:
         why = ": the model has none there for much of the posterior"
@@ -229,9 +224,8 @@ def predict(
 
 def _check_replaceable(out: Path, at: Path, overwrite: bool) -> None:
     """Refuse to replace a file unless it is a prediction, and that is wanted."""
-    # The last column tells that a file is a prediction: of a run, of one that did not converge,
-    # of a diagnosis.
-    last = ("outside_calibrated_range", "converged", "_after_upper")
+    # The last column tells that a file is a prediction, here of a run that did not converge.
+    last = ("outside_calibrated_range", "converged")
     if not overwrite:
         wrong, hint = "the file exists already", "choose another --out, or pass --overwrite"
         raise CalibError(wrong, where=str(out), hint=hint)
@@ -257,7 +251,7 @@ def _predict_corrected(
     from calib.data import read_for_model
     from calib.data.checks import check_conditions
     from calib.data.quantities import QUANTITIES
-    from calib.gap.corrected import conditions_outside, load_corrected, predict_columns
+    from calib.gap.corrected import covered, load_corrected, predict_columns
     from calib.gap.effects import EFFECTS
     from calib.gap.effects.user import load_effects
     from calib.models.simulators.files import load_files
@@ -283,12 +277,29 @@ def _predict_corrected(
             f"what is predicted is the reading, with {', '.join(faults)} in it; once the "
             f"instrument is repaired, predict --without {' --without '.join(faults)}"
         )
-    beyond = conditions_outside(corrected, table)
-    if beyond:
-        counts = ", ".join(f"{name} in {count} rows" for name, count in beyond.items())
-        announce(f"outside what the campaigns covered: {counts}")
+    flags = columns["outside_calibrated_range"]
+    outside = _say_outside(table, covered(corrected, table), [str(row) for row in flags])
+    of_outputs = [v for n, v in columns.items() if n.endswith(("_before", "_after"))]
+    if nowhere := int(np.isnan(np.array(of_outputs, dtype=np.float64)).any(axis=0).sum()):
+        announce(f"no value (nan) at {nowhere} of {len(table)} rows: the simulator has none there")
     _give(columns, out, *campaigns)
-    finish(0, {"columns": _numbers(columns)}, outside=beyond)
+    finish(0, {"columns": _numbers(columns)}, outside=outside)
+
+
+def _say_outside(table: Table, known: Mapping[str, Any], flags: Sequence[Sequence[str]]) -> int:
+    """Warn of rows outside the calibrated range; return how many there are."""
+    from calib.data.checks import beyond_notes
+
+    outside = sum(map(bool, flags))
+    if outside:
+        lie = "row lies" if outside == 1 else "rows lie"
+        announce(
+            f"{outside} {lie} outside the calibrated range, where the prediction is not to be "
+            "trusted"
+        )
+        for note in beyond_notes(table, known):
+            announce(note)
+    return outside
 
 
 def _give(columns: dict[str, Any], out: Path | None, *tables: Table) -> None:

@@ -218,14 +218,17 @@ def beyond_notes(table: Table, known: Mapping[str, Array]) -> Iterator[str]:
         beyond = off > 1e-9 * max(abs(low), abs(high))
         if not beyond.any():
             continue
-        read = usual_in(table, name, table[name][beyond], low, high)
-        column = table.column(name)
-        farthest = float(column.written(table[name][np.argmax(off)]))
+        farthest, read = float(table[name][np.argmax(off)]), ""
+        calibrated = f"{plain_number(low, 4)} to {plain_number(high, 4)}"
+        if name in QUANTITIES:
+            column = table.column(name)
+            farthest, calibrated = float(column.written(farthest)), column.words(low, high)
+            read = usual_in(table, name, table[name][beyond], low, high)
         reach = "as far off as" if beyond.sum() > 1 else "="
         unit = f"; inside if the readings are in {read}; check the unit in the column name"
         yield (
             f"{table.source}, {lines_of(table, beyond)}: {table.header_of(name)} {reach} "
-            f"{plain_number(farthest, 4)}, calibrated from {column.words(low, high)}"
+            f"{plain_number(farthest, 4)}, calibrated from {calibrated}"
             f"{unit if read else ''}"
         )
 

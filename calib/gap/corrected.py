@@ -7,7 +7,6 @@ to. A correction is only as good as the diagnosis: its bands hold the doubt abou
 from __future__ import annotations
 
 import json
-from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from functools import cache
@@ -18,7 +17,7 @@ import numpy as np
 
 from calib.data import Table, write_table
 from calib.data.quantities import OUTPUTS, role_of
-from calib.errors import CalibError
+from calib.errors import CalibError, meant
 from calib.gap.campaigns import Campaigns, campaigns
 from calib.gap.case import Context, cells, read_case, with_declared
 from calib.gap.constants import NAMED, SMALLEST_GAP, SURPRISE, WORTH_SAYING
@@ -269,8 +268,8 @@ def _load_fit(
     return fit
 
 
-def conditions_outside(corrected: Corrected, table: Table) -> dict[str, int]:
-    """Count rows beyond what either campaign covered.
+def covered(corrected: Corrected, table: Table) -> dict[str, Array]:
+    """Return what the campaigns covered of a table's conditions, by canonical column.
 
     Of the order of the runs it is what the field covered, if anything depends on it.
 
@@ -278,15 +277,9 @@ def conditions_outside(corrected: Corrected, table: Table) -> dict[str, int]:
     ----------
     table : Table
         New conditions.
-
-    Returns
-    -------
-    dict of str to int
-        Rows outside by condition; those without any are left out.
     """
     case = corrected.data.case
-    table = with_declared(table, case.covariates)
-    known = {
+    return {
         name: np.concatenate(
             [
                 t[name]
@@ -301,14 +294,12 @@ def conditions_outside(corrected: Corrected, table: Table) -> dict[str, int]:
         and not case.covariates.get(name)
         and (corrected.over_runs or role_of(name) != "order")
     }
-    beyond = outside(known, {name: table[name] for name in known})
-    return dict(Counter(name for row in beyond for name in row))
 
 
 def predict_columns(
     corrected: Corrected, table: Table, left_out: Collection[str] = ()
 ) -> dict[str, Array | list[str]]:
-    """Lay out a prediction at new conditions: columns as given, before, after, 90 % band.
+    """Lay out a prediction at new conditions: columns as given, before, after, 90 % band, flags.
 
     Parameters
     ----------
@@ -328,7 +319,7 @@ def predict_columns(
         raise CalibError(
             f"the corrected model has no cause {', '.join(unknown)} to leave out",
             expected=", ".join(corrected.causes) or "none: it has no cause",
-            hint="name one of these, or leave nothing out",
+            hint=meant(unknown[0], corrected.causes, "name one of these, or leave nothing out"),
         )
     table = with_declared(table, corrected.data.case.covariates)
     needed = corrected.data.view.conditions
@@ -355,7 +346,9 @@ def predict_columns(
             f"{column}_after_lower": p.lower,
             f"{column}_after_upper": p.upper,
         }
-    return columns
+    known = covered(corrected, table)
+    flags = outside(known, {name: table[name] for name in known}) or [()] * len(table)
+    return columns | {"outside_calibrated_range": ["+".join(row) for row in flags]}
 
 
 @dataclass(frozen=True)
@@ -386,15 +379,15 @@ class NewPrediction:
 
 def predict_new(truth: Truth, before: Mapping[str, Array]) -> dict[str, NewPrediction]:
     """Predict with the calibrated simulator and with the corrected one."""
-    return {
-        name: NewPrediction(
-            before[name],
-            truth.mean(values),
-            truth.quantile(truth.measured[name], 0.05),
-            truth.quantile(truth.measured[name], 0.95),
-        )
-        for name, values in truth.truth.items()
-    }
+    found = {}
+    for name, values in truth.truth.items():
+        after = truth.mean(values)
+        # Where the simulator has no value, the correction of it is none either.
+        no_value = np.isnan(before[name] + after)
+        band = (truth.quantile(truth.measured[name], q) for q in (0.05, 0.95))
+        of_it = (np.where(no_value, np.nan, part) for part in (after, *band))
+        found[name] = NewPrediction(before[name], *of_it)
+    return found
 
 
 def shrink(

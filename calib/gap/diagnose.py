@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, fields, replace
@@ -20,7 +21,7 @@ from calib.gap.corrected import (
     Corrected,
     NewPrediction,
     Shrink,
-    conditions_outside,
+    covered,
     predict_new,
     shrink,
 )
@@ -48,6 +49,7 @@ from calib.gap.ranking import Lab, Ranking, calibrate_lab, rank
 from calib.gap.screening import left_over, screen, without_field_outliers, without_outputs
 from calib.inference.random import generator
 from calib.models.base import Array
+from calib.validation.prediction import outside
 from calib.validation.residuals import Remark
 
 
@@ -235,11 +237,13 @@ def _beyond(corrected: Corrected, before: Mapping[str, Array]) -> list[str]:
     new = corrected.data.case.new_conditions
     if new is None:
         return []
+    known = covered(corrected, new)
+    beyond = Counter(c for row in outside(known, {c: new[c] for c in known}) for c in row)
     said = [
         f"{new.source}: beyond what "
         f"{'the field' if role_of(name) == 'order' else 'either campaign'} covered in {name}: "
         f"{rows} of {len(new)} rows, where what is predicted is extrapolated"
-        for name, rows in conditions_outside(corrected, new).items()
+        for name, rows in beyond.items()
     ]
     columns, plain = corrected.data.case.field.columns, {*OUTPUTS.values(), *columns_of("order")}
     lacking = [n for n in columns if n not in new and n not in plain and np.ptp(columns[n]) > 0.0]

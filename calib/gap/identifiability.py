@@ -122,7 +122,7 @@ def smallest_shown(prior: Array, sd: float, ln_odds: float) -> float:
     while first > 0.0 and value / slope > 1e-4:
         first = max(first - value / slope, 0.0)
         value, slope = beyond(first)
-    return first + 0.8416 * sd  # 80 % power
+    return max(first + 0.8416 * sd, MIN_EFFECT_SIZE)  # 80 % power
 
 
 def _cosine_similarities(left: Mapping[str, Array]) -> dict[tuple[str, str], float]:

@@ -124,7 +124,7 @@ def oddities(lab: Table, field: Table, models: Mapping[str, str]) -> tuple[str, 
         for table, rows in ((lab, "calibration"), (field, "field")):
             readings = table[OUTPUTS[output]] if OUTPUTS[output] in table else np.empty(0)
             if missing := int(np.isnan(readings).sum()):
-                said.append(f"{missing} of {len(table)} {rows} rows have no {output}")
+                said.append(f"no reading of {output} in {missing} of {len(table)} {rows} rows")
     return (*said, *_other_units(lab, field, models))
 
 

@@ -285,18 +285,25 @@ def _with_residuals(screen: Screen, odds: Odds, found: Sequence[Candidate]) -> l
 
 
 def _check_names(context: Context, known: set[str]) -> None:
-    """Refuse a context that speaks of what nobody knows."""
-    strange = [n for n in context.names if n not in known and n != "parameter_shift"]
-    strange += [n for n in (*context.excluded, *context.sizes) if n == "parameter_shift"]
-    if strange:
-        raise CalibError(
-            f"the context speaks of {strange[0]}",
-            where="[context] of case.toml",
-            expected=", ".join(sorted(known)) + "; parameter_shift may be suspected",
-            hint="leave it out"
-            if strange[0] == "parameter_shift"
-            else meant(strange[0], known, "correct the name, or leave it out"),
-        )
+    """Refuse a context with causes that nobody knows, or that cannot be taken out."""
+    always = ("parameter_shift", "unknown")
+    for name in (*context.excluded, *context.sizes):
+        if name in always:
+            raise CalibError(
+                f"{name} has no size that could be known, and is always considered",
+                where="[context] of case.toml",
+                hint="write same_soil = true if field and laboratory have the same soil"
+                if name == "parameter_shift"
+                else "take it out",
+            )
+    for name in context.names:
+        if name not in known and name != "parameter_shift":
+            raise CalibError(
+                f"{name} is no cause that is known",
+                where="[context] of case.toml",
+                expected=", ".join(sorted(known)) + "; parameter_shift may be suspected",
+                hint=meant(name, known, "correct the name, or leave it out"),
+            )
 
 
 def _scored(

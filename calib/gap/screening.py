@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.data import Table
-from calib.data.checks import mixed_units
+from calib.data.checks import check_conditions, mixed_units
 from calib.data.files import plain_number
 from calib.data.quantities import OUTPUTS, QUANTITIES, role_of
 from calib.gap.campaigns import Campaigns, OutputData, campaigns, check_ratio
@@ -32,7 +32,11 @@ from calib.models.base import Array
 
 def check_units(case: Case) -> None:
     """Refuse campaigns whose conditions cannot be in the same unit."""
-    for name in {c: None for model in case.models.values() for c in get_model(model).conditions}:
+    used = {c: None for model in case.models.values() for c in get_model(model).conditions}
+    check_conditions(
+        case.field, {c: case.lab[c] for c in used if c in case.lab and c in case.field}
+    )
+    for name in used:
         if name in case.lab and name in case.field:
             lab, field = (float(np.median(table[name])) for table in (case.lab, case.field))
             if min(lab, field) > 0.0:

@@ -53,8 +53,8 @@ def test_fit_predict_and_read_the_numbers(calib: Calib, he2019: Path, tmp_path: 
     lines = [line.split(",") for line in printed.out.splitlines()]
     header, *rows = lines
     assert len(rows) == 4
-    assert "warning: 1 row lies outside the calibrated range" in printed.err
-    assert "warning: at.csv, line 5: slip_percent = 60, calibrated from " in printed.err
+    assert "calib: 1 row lies outside the calibrated range" in printed.err
+    assert "calib: at.csv, line 5: slip_percent = 60, calibrated from " in printed.err
     assert [row[-1] for row in rows] == ["", "", "", "slip_ratio"]
     assert [row[header.index("data_label")] for row in rows] == ["reconstructed"] * 4
     number = {

@@ -118,14 +118,14 @@ def test_a_diagnosis_with_an_effect_of_ones_own_is_predicted_from_with_it(calib:
     rows = Path("p.csv").read_text().splitlines()
     assert len(rows) == len(fresh.read_text().splitlines())
     assert "rut_depth_mm" in rows[0]
-    # Beyond what either campaign covered it is said of each condition in how many rows.
+    # Beyond what either campaign covered it is said of each condition in which rows.
     head, first, *_ = fresh.read_text().splitlines()
     names, cells = head.split(","), first.split(",")
     cells[names.index("slip_ratio")] = "0.9"
     Path("far.csv").write_text(f"{head}\n{first}\n{','.join(cells)}\n")
     far = calib("predict", "found", "--at", "far.csv", "--effects", "mine.py")
     assert far.code == 0, far.err
-    assert "outside what the campaigns covered: slip_ratio in 1 rows" in far.err
+    assert "far.csv, line 3: slip_ratio = 0.9, calibrated from" in far.err
     Path("percent.csv").write_text(fresh.read_text().replace("slip_ratio", "slip_percent"))
     percent = calib("predict", "found", "--at", "percent.csv", "--effects", "mine.py")
     assert_refused(percent, ["percent.csv", "'slip_percent'", "readings are in fractions"])

@@ -310,13 +310,16 @@ def test_what_is_wrong_with_a_context_is_named(tmp_path, table, words):
 )
 def test_names_that_nobody_knows_are_refused(context):
     case = make_case("force_offset", models=PULL_ONLY)
-    with pytest.raises(CalibError, match=r"speaks of|no parameter"):
+    with pytest.raises(CalibError, match=r"no cause that is known|always considered|no parameter"):
         diagnose_once(replace(case, context=context), 1)
 
 
 def test_of_a_misspelt_cause_the_one_most_like_it_is_named():
     case = make_case("force_offset", models=PULL_ONLY)
-    for name, hint in (("sensr_drift", "did you mean sensor_drift"), ("parameter_shift", "leave")):
+    for name, hint in (
+        ("sensr_drift", "did you mean sensor_drift"),
+        ("parameter_shift", "same_soil = true"),
+    ):
         with pytest.raises(CalibError, match=hint):
             diagnose_once(replace(case, context=Context(excluded=(name,))), 1)
 

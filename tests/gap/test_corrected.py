@@ -19,7 +19,6 @@ from calib.gap.campaigns import campaigns
 from calib.gap.case import read_case
 from calib.gap.corrected import (
     Corrected,
-    conditions_outside,
     load_corrected,
     predict_columns,
     predict_new,
@@ -245,7 +244,7 @@ def test_a_prediction_is_laid_out_by_output(made):
         for column in ("drawbar_pull_kn", "rut_depth_mm")
         for part in ("before", "after", "after_lower", "after_upper")
     ]
-    assert list(found) == [*header[:-1], *of_outputs]
+    assert list(found) == [*header[:-1], *of_outputs, "outside_calibrated_range"]
     assert found["operator"] == [row[0] for row in words]
     assert found["Site"] == ["A"] * len(field)
     assert found["Slip [%]"] == [row[3] for row in words]
@@ -271,15 +270,17 @@ def test_missing_covariates_are_named(saved):
         predict_columns(load_corrected(folder), few)
 
 
-def test_conditions_beyond_both_campaigns_are_counted(saved):
+def test_conditions_beyond_both_campaigns_are_named(saved):
     found, folder = saved
-    case = found.data.case
-    assert conditions_outside(load_corrected(folder), case.field) == {}
+    case, flags = found.data.case, "outside_calibrated_range"
+    assert set(predict_columns(load_corrected(folder), case.field)[flags]) == {""}
     fast = {
         **case.field.columns,
         "speed_m_s": case.field["speed_m_s"] * np.array([30.0] + [1.0] * 26),
     }
-    assert conditions_outside(load_corrected(folder), table_from_arrays(fast)) == {"speed_m_s": 1}
+    predicted = predict_columns(load_corrected(folder), table_from_arrays(fast))
+    assert predicted[flags] == ["speed_m_s", *[""] * 26]
+    assert list(predicted)[-1] == flags
 
 
 def test_an_effect_of_ones_own_is_passed_to_predict(tmp_path, capsys):
@@ -298,8 +299,8 @@ def test_an_effect_of_ones_own_is_passed_to_predict(tmp_path, capsys):
     assert done.exit_code == 0
     assert "no run_order is given" in done.stderr
     header, *rows = done.stdout.splitlines()
-    values = np.array([row.split(",") for row in rows], float).T
-    columns = dict(zip(header.split(","), values, strict=True))
+    values = np.array([row.split(",")[:-1] for row in rows], float).T
+    columns = dict(zip(header.split(",")[:-1], values, strict=True))
     change = columns["drawbar_pull_kn_after"] - columns["drawbar_pull_kn_before"]
     # The offset of the case, which the wind explains, to two noise sds of its mean and the lab's.
     np.testing.assert_allclose(change.mean(), LARGE["force_offset"]["offset"], atol=0.02)

@@ -510,17 +510,17 @@ def test_more_rows_show_smaller_effects():
 def test_the_smallest_size_shown_is_that_of_the_bayes_factor():
     """Against a fine sum over a uniform prior from the relevant size on, and its limits."""
     prior = np.linspace(0.0, 10.0, 10_001)
-    sd, ln_odds = 0.25, 5.0
+    sd, ln_odds = 0.5, 5.0
     sizes = prior[prior >= MIN_EFFECT_SIZE]
 
     def ln_factor(estimate: float) -> float:
         with_effect = norm.pdf(estimate, sizes, sd).mean()
         return float(np.log(with_effect / norm.pdf(estimate, 0.0, sd)))
 
-    threshold = brentq(lambda t: ln_factor(t) - ln_odds, 0.1, 3.0)
+    threshold = brentq(lambda t: ln_factor(t) - ln_odds, 0.1, 5.0)
     found = smallest_shown(prior, sd, ln_odds)
     assert found == pytest.approx(threshold + norm.ppf(0.8) * sd, abs=0.01)
-    assert smallest_shown(prior, 1e-3, ln_odds) == pytest.approx(0.5 * MIN_EFFECT_SIZE, abs=0.02)
+    assert smallest_shown(prior, 1e-3, ln_odds) == MIN_EFFECT_SIZE
     assert smallest_shown(prior[prior < MIN_EFFECT_SIZE], sd, ln_odds) == np.inf
 
 
