@@ -289,7 +289,7 @@ def test_conditions_a_hundred_times_apart_are_in_another_unit(lab, field, refuse
     """Of two that may be zero nothing is known by their ratio."""
     case = case_of([lab] * 5, [field] * 5, "slip_ratio")
     with (
-        pytest.raises(CalibError, match="typically|is usual|in percent")
+        pytest.raises(CalibError, match=r"typically|is usual|in percent")
         if refused
         else nullcontext()
     ):
