@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from calib.gap.case import Case, read_case
     from calib.gap.diagnose import Diagnosis, diagnose
     from calib.gap.effects import Effect
+    from calib.gap.predict import predict
     from calib.he2019.audit import Audit, run_audit
     from calib.he2019.embedded import load_he2019
     from calib.inference.calibration import Calibration, calibrate
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
     from calib.models.simulators.files import read_simulator
     from calib.report.gap_words import gap_verdict
     from calib.report.verdict import Verdict, verdict
-    from calib.validation.prediction import Prediction, predict
+    from calib.validation.prediction import Prediction
     from calib.validation.validate import Validation, leave_one_out, validate_held_out
 
 _HOME = {
@@ -46,6 +47,7 @@ _HOME = {
     "calib.gap.case": "Case read_case",
     "calib.gap.diagnose": "Diagnosis diagnose",
     "calib.gap.effects": "Effect",
+    "calib.gap.predict": "predict",
     "calib.he2019.audit": "Audit run_audit",
     "calib.he2019.embedded": "load_he2019",
     "calib.inference.calibration": "Calibration calibrate",
@@ -61,7 +63,7 @@ _HOME = {
     "calib.report.gap_words": "gap_verdict",
     "calib.report.verdict": "Verdict verdict",
     "calib.validation.comparison": "Comparison compare",
-    "calib.validation.prediction": "Prediction predict",
+    "calib.validation.prediction": "Prediction",
     "calib.validation.validate": "Validation leave_one_out validate_held_out",
 }
 

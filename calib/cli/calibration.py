@@ -263,7 +263,7 @@ def compare(
     emulations = emulate(rows, seed, workers, [held])
     with progress_bars() as tell:
         found = compare_models(
-            fitted, models, seed, held_out=held, priors=given,
+            models, fitted, seed, held_out=held, priors=given,
             settings=SamplerSettings(max_steps=max_steps), progress=tell, workers=workers,
         )  # fmt: skip
     write = partial(

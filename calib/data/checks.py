@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from calib.data.files import plain_number
 from calib.data.quantities import QUANTITIES, Quantity, columns_of, convert
+from calib.data.reader import Tabular, as_table
 from calib.data.table import CHECKED, Table, accepted_headers, columns_meant, parse_header
 from calib.errors import CalibError
 
@@ -368,13 +369,13 @@ def check_varies(table: Table, column: str) -> None:
 
 
 def hold_out(
-    table: Table, quantity_header: str, value: float, rel_tol: float = 1e-3
+    table: Tabular, quantity_header: str, value: float, rel_tol: float = 1e-3
 ) -> tuple[Table, Table]:
     """Set aside the rows at one value of a quantity.
 
     Parameters
     ----------
-    table : Table
+    table : Table, mapping of str to array_like, or pandas.DataFrame
     quantity_header : str
         A column name in any unit, such as ``"inflation_pressure_psi"``; the data may have it in
         another one.
@@ -393,7 +394,7 @@ def hold_out(
     CalibError
         If no row has that value, listing those present, or if every row has it.
     """
-    column = parse_header(quantity_header)
+    table, column = as_table(table), parse_header(quantity_header)
     if column is None or column.quantity.canonical not in table:
         guess = columns_meant(
             [quantity_header], [n for n in table if n in QUANTITIES], shortened=True

@@ -12,10 +12,10 @@ import logging
 import math
 import os
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,6 +27,17 @@ from calib.data.table import CHECKED, MAX_TEXT_ROWS, Column, Table, match_header
 from calib.errors import CalibError
 
 type Array = NDArray[np.float64]
+
+
+class Frame(Protocol):
+    """What a pandas DataFrame has."""
+
+    def items(self) -> Iterable[tuple[Any, Any]]:
+        """Return columns by name."""
+
+
+# What stands for a table: columns by names with units, as in a file.
+type Tabular = Table | Mapping[str, ArrayLike] | Frame
 
 _log = logging.getLogger(__name__)
 
@@ -475,6 +486,29 @@ def table_from_arrays(
         text = tuple(zip(*cells, strict=True))
     table = Table(values, source, np.array(rows), header, text, digest.hexdigest(), label)
     return _labelled(table, ignored)
+
+
+def as_table(data: Tabular) -> Table:
+    """Return a table as it is; make one of a mapping or a data frame.
+
+    Parameters
+    ----------
+    data : Table, mapping of str to array_like, or pandas.DataFrame
+        Column names with units, as in a file, to values.
+
+    Raises
+    ------
+    CalibError
+        As `table_from_arrays` does.
+
+    Examples
+    --------
+    >>> as_table({"slip_percent": [5.0, 20.0]})["slip_ratio"].tolist()
+    [0.05, 0.2]
+    """
+    if isinstance(data, Table):
+        return data
+    return table_from_arrays({str(name): values for name, values in data.items()})
 
 
 def _common_length(arrays: Mapping[str, NDArray[Any]], source: str) -> int:

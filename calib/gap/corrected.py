@@ -30,6 +30,7 @@ from calib.gap.mixture import Mixture, Truth
 from calib.gap.noise import Noise
 from calib.inference.priors import Priors
 from calib.models.base import Array
+from calib.shown import Shown
 from calib.validation.prediction import echoed, outside
 
 SCHEMA = "calib/corrected/6"
@@ -349,6 +350,39 @@ def predict_columns(
     known = covered(corrected, table)
     flags = outside(known, {name: table[name] for name in known}) or [()] * len(table)
     return columns | {"outside_calibrated_range": ["+".join(row) for row in flags]}
+
+
+@dataclass(frozen=True, repr=False)
+class CorrectedPrediction(Shown):
+    """A prediction of a diagnosis at new conditions.
+
+    Parameters
+    ----------
+    conditions : mapping of str to ndarray, shape (n,)
+        By canonical column.
+    columns : mapping of str to ndarray or list of str
+        As `predict_columns` lays them out.
+    """
+
+    conditions: Mapping[str, Array]
+    columns: Mapping[str, Array | list[str]]
+
+    def __repr__(self) -> str:
+        """Name the outputs, and say how many rows are outside."""
+        outputs = [n.removesuffix("_after") for n in self.columns if n.endswith("_after")]
+        flags = self.columns["outside_calibrated_range"]
+        return (
+            f"<CorrectedPrediction of {', '.join(outputs)} at {len(flags)} rows, "
+            f"{sum(map(bool, flags))} outside the calibrated range>"
+        )
+
+
+def predict_corrected(
+    corrected: Corrected, table: Table, left_out: Collection[str] = ()
+) -> CorrectedPrediction:
+    """Predict at new conditions; see `predict_columns`."""
+    conditions = {n: v for n, v in table.columns.items() if n not in OUTPUTS.values()}
+    return CorrectedPrediction(conditions, predict_columns(corrected, table, left_out))
 
 
 @dataclass(frozen=True)

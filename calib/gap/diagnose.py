@@ -49,12 +49,13 @@ from calib.gap.ranking import Lab, Ranking, calibrate_lab, rank
 from calib.gap.screening import left_over, screen, without_field_outliers, without_outputs
 from calib.inference.random import generator
 from calib.models.base import Array
+from calib.shown import Shown
 from calib.validation.prediction import outside
 from calib.validation.residuals import Remark
 
 
 @dataclass(frozen=True, repr=False)
-class Diagnosis:
+class Diagnosis(Shown):
     """What was found for a case.
 
     Parameters

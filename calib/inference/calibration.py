@@ -14,6 +14,7 @@ from calib.inference.problem import Problem
 from calib.inference.random import stream
 from calib.inference.sampler import Draws, Progress, SamplerSettings, sample_posterior
 from calib.models.base import Array
+from calib.shown import Shown
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class ParameterSummary:
 
 
 @dataclass(frozen=True, repr=False)
-class Calibration:
+class Calibration(Shown):
     """A calibrated model.
 
     Parameters

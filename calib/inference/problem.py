@@ -22,10 +22,11 @@ from functools import cached_property
 
 import numpy as np
 
-from calib.data import Table, check_enough, check_settings, check_varies
+from calib.data import Table, as_table, check_enough, check_settings, check_varies
 from calib.data.checks import check_units
 from calib.data.files import plain_number
 from calib.data.quantities import QUANTITIES
+from calib.data.reader import Tabular
 from calib.data.table import accepted_headers
 from calib.errors import CalibError
 from calib.inference.constants import HALF_LN_2PI
@@ -324,7 +325,7 @@ class Problem:
 
 def build_problem(
     model_name: str,
-    table: Table,
+    table: Tabular,
     prior_path: PriorFile | None = None,
     *,
     fixed: Mapping[str, float] | None = None,
@@ -335,7 +336,7 @@ def build_problem(
     ----------
     model_name : str
         One of `calib.models.MODELS`.
-    table : Table
+    table : Table, mapping of str to array_like, or pandas.DataFrame
         Calibration data with the model's conditions and its output.
     prior_path : Path or PriorFile, optional
         The model's own, or the shipped one, by default.
@@ -349,7 +350,7 @@ def build_problem(
         setting of the conditions or with one output; if the priors do not fit the model, leave no
         parameter free, or expect outputs of quite another size.
     """
-    model = get_model(model_name)
+    model, table = get_model(model_name), as_table(table)
     table.must_have(*model.conditions, model.output)
     references = prior_references(table.columns)
     priors = read_priors(

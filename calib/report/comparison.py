@@ -424,7 +424,7 @@ class ComparisonSection(Section[Comparison]):
         """Compare them; processes of its own leave rows out."""
         fitted, held = fitted_rows(self.task)
         how: Any = {"settings": self.settings, "progress": tell, "workers": self.workers}
-        return compare(fitted, self.models, study.seed, held_out=held, priors=self.priors, **how)
+        return compare(self.models, fitted, study.seed, held_out=held, priors=self.priors, **how)
 
     @property
     def _held_out(self) -> str:

@@ -32,10 +32,14 @@ class Result(Protocol):
 
 
 class Fitted(NamedTuple):
-    """A calibration and its validation, if any, where there is no more of a result."""
+    """A calibration and its validation, if any, where there is no more of a result.
+
+    The predictive measurements, shape (draws, n), are at the calibration conditions.
+    """
 
     calibration: Calibration
     validation: Validation | None
+    posterior_predictive: Array | None = None
 
 
 @dataclass(frozen=True)

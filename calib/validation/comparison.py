@@ -19,7 +19,8 @@ import numpy as np
 from scipy.special import logsumexp
 
 from calib.batch.folders import keep
-from calib.data import Table
+from calib.data import Table, as_table
+from calib.data.reader import Tabular
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import estimate
@@ -30,6 +31,7 @@ from calib.inference.random import generator
 from calib.inference.sampler import Progress, SamplerSettings
 from calib.models import get_model
 from calib.models.base import Array
+from calib.shown import Shown
 from calib.validation.constants import CLEAR, SMALL
 from calib.validation.residuals import WORDS
 from calib.validation.validate import Validation, leave_one_out, validate_held_out
@@ -81,8 +83,8 @@ class Difference(NamedTuple):
         return self.elpd > max(SMALL, CLEAR * self.se)
 
 
-@dataclass(frozen=True)
-class Comparison:
+@dataclass(frozen=True, repr=False)
+class Comparison(Shown):
     """Models on the same rows, the best first.
 
     Parameters
@@ -96,6 +98,11 @@ class Comparison:
     candidates: tuple[Candidate, ...]
     weights: Mapping[str, float]
     seed: int
+
+    def __repr__(self) -> str:
+        """Name the models with their weights."""
+        weights = ", ".join(f"{c.model} {self.weights[c.model]:.2f}" for c in self.candidates[:5])
+        return f"<Comparison on {self.candidates[0].rows.size} rows, weights: {weights}>"
 
     @property
     def sound(self) -> bool:
@@ -147,11 +154,11 @@ def difference(rows: Array) -> Difference:
 
 
 def compare(
-    table: Table,
     models: Sequence[str],
+    table: Tabular,
     seed: int = 2019,
     *,
-    held_out: Table | None = None,
+    held_out: Tabular | None = None,
     priors: Mapping[str, Path] | None = None,
     settings: SamplerSettings | None = None,
     progress: ComparisonProgress | None = None,
@@ -161,11 +168,11 @@ def compare(
 
     Parameters
     ----------
-    table : Table
-        With the output, and the conditions of every model.
     models : sequence of str
         At least two, of one output.
-    held_out : Table, optional
+    table : Table, mapping of str to array_like, or pandas.DataFrame
+        With the output, and the conditions of every model.
+    held_out : Table, mapping or DataFrame, optional
         Rows of the same campaign that are not fitted.
     priors : mapping of str to Path, optional
         Prior files by model; the shipped ones by default.
@@ -186,10 +193,11 @@ def compare(
     (2018), doi:10.1214/17-BA1091; Sivula, Magnusson, Matamoros & Vehtari (2020), arXiv:2008.10296.
     """
     check_comparable(models)
-    given = priors or {}
+    given, table = priors or {}, as_table(table)
     return compare_problems(
-        [build_problem(name, table, given.get(name)) for name in models], seed, held_out=held_out,
-        settings=settings, progress=progress, workers=workers,
+        [build_problem(name, table, given.get(name)) for name in models], seed,
+        held_out=None if held_out is None else as_table(held_out), settings=settings,
+        progress=progress, workers=workers,
     )  # fmt: skip
 
 

@@ -21,6 +21,7 @@ from calib.data import Table
 from calib.data.checks import stretches
 from calib.inference.random import generator
 from calib.models.base import Array
+from calib.shown import Shown
 from calib.validation.constants import LEVELS, MIN_DEFINED, N_DRAWS
 
 if TYPE_CHECKING:
@@ -37,8 +38,8 @@ class Bands:
     upper: Mapping[float, Array]
 
 
-@dataclass(frozen=True)
-class Prediction:
+@dataclass(frozen=True, repr=False)
+class Prediction(Shown):
     """A prediction at n conditions.
 
     Parameters
@@ -64,6 +65,14 @@ class Prediction:
     predictive: Bands
     outside: tuple[tuple[str, ...], ...]
     defined: Array
+
+    def __repr__(self) -> str:
+        """Name the output, and say how many rows there are and how many are outside."""
+        outside = sum(map(bool, self.outside))
+        return (
+            f"<Prediction of {self.output} at {len(self.outside)} rows, {outside} outside the "
+            "calibrated range>"
+        )
 
 
 @one_thread()
@@ -225,8 +234,12 @@ def median_change(calibration: Calibration, column: str) -> float:
 
 def prediction_columns(prediction: Prediction, table: Table) -> dict[str, Array | list[str]]:
     """Lay a prediction out as columns of a CSV: the table's conditions first, as given."""
-    output = prediction.output
-    columns: dict[str, Array | list[str]] = echoed(table, output)
+    return echoed(table, prediction.output) | band_columns(prediction)
+
+
+def band_columns(prediction: Prediction) -> dict[str, Array | list[str]]:
+    """Lay out median and bands as columns, then what is outside the calibrated range."""
+    output, columns = prediction.output, dict[str, Array | list[str]]()
     columns[f"{output}_median"] = prediction.predictive.median
     kinds = {"parameter": prediction.parameter, "predictive": prediction.predictive}
     for kind, banded in kinds.items():

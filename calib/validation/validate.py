@@ -15,7 +15,8 @@ from scipy.special import logsumexp
 
 from calib.batch.environment import one_thread
 from calib.batch.tasks import completed
-from calib.data import Table
+from calib.data import Table, as_table
+from calib.data.reader import Tabular
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration
 from calib.inference.diagnostics import mcse, psis, tail_shape
@@ -66,12 +67,12 @@ class Validation:
 
 
 @one_thread()
-def validate_held_out(calibration: Calibration, held_out: Table) -> Validation:
+def validate_held_out(calibration: Calibration, held_out: Tabular) -> Validation:
     """Score the calibration on rows it has not seen.
 
     Parameters
     ----------
-    held_out : Table
+    held_out : Table, mapping of str to array_like, or pandas.DataFrame
         With the model's conditions and its output.
 
     Raises
@@ -84,7 +85,7 @@ def validate_held_out(calibration: Calibration, held_out: Table) -> Validation:
     A parameter vector for which the equation has no value at one of the rows (a quadratic in
     pressure that is negative beyond the calibrated ones) is left out.
     """
-    model = calibration.problem.bound.model
+    model, held_out = calibration.problem.bound.model, as_table(held_out)
     rng = generator(calibration.seed, calibration.label, "validate")
     _, draws = predictive_draws(calibration, model.select(held_out.columns), rng)
     draws = draws[np.isfinite(draws).all(axis=1)]

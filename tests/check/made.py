@@ -94,7 +94,7 @@ def comparison(out: Path, seed: int = 2019) -> Path:
     path = out.with_suffix(".csv")
     path.write_text(example_csv("reece"))
     fitted, held = hold_out(read_table(path), "plate_width_mm", 80.0)
-    found = compare(fitted, ["bekker_plate", "bekker"], seed, held_out=held, settings=SETTINGS)
+    found = compare(["bekker_plate", "bekker"], fitted, seed, held_out=held, settings=SETTINGS)
     out.mkdir()
     write_comparison(found, out, ["calib", "compare"], "plate_width_mm=80")
     return out

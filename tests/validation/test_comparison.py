@@ -57,7 +57,7 @@ def plates(seed: int, friction: float) -> calib.Table:
 @pytest.fixture(scope="module")
 def frictional() -> Comparison:
     fitted, held = hold_out(plates(1, 1.0), "plate_width_mm", 100.0)
-    return compare(fitted, ["bekker", "reece", "bekker_plate"], 3, held_out=held, settings=FEW)
+    return compare(["bekker", "reece", "bekker_plate"], fitted, 3, held_out=held, settings=FEW)
 
 
 def test_weights_are_those_of_an_optimiser() -> None:
@@ -105,7 +105,7 @@ def test_models_that_say_the_same_are_not_told_apart() -> None:
     rows = plates(4, 0.0).columns
     # Of one width, Reece's and Bekker's equations are the same curve.
     one = table_from_arrays({**rows, "plate_width_mm": np.full(len(rows[PLATE[0]]), 100.0)})
-    found = compare(one, ["reece", "bekker_plate"], 5, settings=FEW)
+    found = compare(["reece", "bekker_plate"], one, 5, settings=FEW)
     assert not found.differences[found.candidates[1].model].clear
     assert "cannot tell" in found.sentence
 
@@ -113,11 +113,11 @@ def test_models_that_say_the_same_are_not_told_apart() -> None:
 def test_unlike_models_are_refused() -> None:
     table = plates(1, 1.0)
     with pytest.raises(CalibError, match="nothing to compare in reece"):
-        compare(table, ["reece"])
+        compare(["reece"], table)
     with pytest.raises(CalibError, match="different outputs"):
-        compare(table, ["reece", "magic_formula"])
+        compare(["reece", "magic_formula"], table)
     with pytest.raises(CalibError, match="there is no model"):
-        compare(table, ["reece", "rice"])
+        compare(["reece", "rice"], table)
 
 
 def test_a_stack_is_written_and_predicts(frictional: Comparison, tmp_path: Path) -> None:
@@ -176,7 +176,7 @@ def test_measured_plates_prefer_a_law_with_width() -> None:
     table = table_from_arrays(
         dict(zip(PLATE, (columns[0], 1e3 * columns[1], 1e3 * columns[2]), strict=True))
     )
-    found = compare(table, ["bekker", "bekker_plate", "reece"], 7)
+    found = compare(["bekker", "bekker_plate", "reece"], table, 7)
     assert found.sound
     assert found.candidates[0].model == "bekker_plate"
     assert found.differences["bekker"].clear

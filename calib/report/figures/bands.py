@@ -21,14 +21,24 @@ from calib.report.figures import style
 from calib.report.figures.style import BLACK, BLUE, DASHES, DOTS, GREY, VERMILION, Plate, caption
 from calib.report.labels import Axis, axis_of, short
 from calib.report.reference import NOTHING, Reference
-from calib.report.rows import Group, data_word, grid, group_column, groups, held_table, x_column
+from calib.report.rows import (
+    Fitted,
+    Group,
+    data_word,
+    grid,
+    group_column,
+    groups,
+    held_table,
+    x_column,
+)
 from calib.report.study import OutputResult
 from calib.validation.prediction import Bands, hits, median_change, smooth_bands
 
 # Lighter outwards, also in greyscale.
 FILLS = {0.95: "#dfebf5", 0.9: "#bcd6ea", 0.5: "#86b5d9"}
 
-type _Draw = Callable[[Axes, OutputResult, Group], dict[str, Any]]
+type _Result = OutputResult | Fitted
+type _Draw = Callable[[Axes, Any, Group], dict[str, Any]]
 
 
 def _scaled(axis: Axis, found: Bands) -> Bands:
@@ -45,7 +55,7 @@ def _points(ax: Axes, x: Array, y: Array, *, held: bool = False) -> Any:
     return ax.plot(x, y, "o", ms=3.6, color=BLACK, zorder=4, **DOTS)[0]
 
 
-def _by_group(result: OutputResult, shown: list[Group], draw: _Draw, **layout: Any) -> Figure:
+def _by_group(result: _Result, shown: list[Group], draw: _Draw, **layout: Any) -> Figure:
     """Draw a panel for each group, a legend below all."""
     cols = min(3, len(shown))
     width = style.DOUBLE_MM if cols > 1 else style.MIDDLE_MM
@@ -67,19 +77,30 @@ def _by_group(result: OutputResult, shown: list[Group], draw: _Draw, **layout: A
 
 def bands_plate(result: OutputResult, reference: Reference = NOTHING) -> Plate:
     """Draw the predictive bands of an output along slip or pressure, beside a published fit."""
-    shown = groups(result)
+    said = _bands_caption(result, len(groups(result)))
+    return Plate(bands_figure(result, reference), "bands", said, "Prediction and data")
 
-    def draw(ax: Axes, result: OutputResult, group: Group) -> dict[str, Any]:
+
+def bands_figure(result: _Result, reference: Reference = NOTHING) -> Figure:
+    """Draw predictive bands and data along slip or pressure, or along cone index of a density."""
+    columns, shown = cone_and_water(result.calibration.problem.bound.model), groups(result)
+    if columns is not None:
+        figure, axes = style.panels(
+            1, 1, height=64.0, width=style.MIDDLE_MM, bottom=22.0, right=24.0
+        )
+        style.legend_below(figure, _against_cone_index(axes[0, 0], figure, result, *columns), 2)
+        return figure
+
+    def draw(ax: Axes, result: _Result, group: Group) -> dict[str, Any]:
         handles = _panel(ax, result, group, reference)
         ax.margins(x=0.02)
         return handles
 
     height = 52.0 if len(shown) > 1 else 60.0
-    figure = _by_group(result, shown, draw, height=height, bottom=20.0, top=7.0)
-    return Plate(figure, "bands", _bands_caption(result, len(shown)), "Prediction and data")
+    return _by_group(result, shown, draw, height=height, bottom=20.0, top=7.0)
 
 
-def _panel(ax: Axes, result: OutputResult, group: Group, reference: Reference) -> dict[str, Any]:
+def _panel(ax: Axes, result: _Result, group: Group, reference: Reference) -> dict[str, Any]:
     problem, held = result.calibration.problem, held_table(result)
     x, y = x_column(result), problem.bound.model.output
     conditions = grid(result, group)
@@ -101,15 +122,15 @@ def _panel(ax: Axes, result: OutputResult, group: Group, reference: Reference) -
         dashes = {"lw": 1.4, "ls": DASHES[3], "zorder": 3}
         (line,) = ax.plot(along, y_axis.scale(curve[0]), color=style.ORANGE, **dashes)
         handles[f"published fit ({curve[1]})"] = line
-    word = data_word(result)
+    word, unseen = data_word(result), None if result.validation is None else result.validation.draws
     for table, rows, draws, name, is_held in (
         (problem.table, group.fitted, result.posterior_predictive, "calibrated", False),
-        (held, group.held_out, result.validation.draws, "held out", True),
+        (held, group.held_out, unseen, "held out", True),
     ):
         if table is None or not rows.any():
             continue
         away = rows & _elsewhere(table, conditions, x)
-        if away.any():
+        if away.any() and draws is not None:
             low, high = y_axis.scale(np.nanquantile(draws[:, away], [0.05, 0.95], axis=0))
             handles["90 % at the row's own conditions"] = ax.vlines(
                 scale(table[x][away]), low, high, color=GREY, lw=3.0, alpha=0.5, zorder=3.5
@@ -249,7 +270,7 @@ def cone_and_water(model: Model) -> tuple[str, str] | None:
 
 
 def _against_cone_index(
-    ax: Axes, fig: Figure, result: OutputResult, cone: str, water: str
+    ax: Axes, fig: Figure, result: _Result, cone: str, water: str
 ) -> dict[str, Any]:
     problem = result.calibration.problem
     ci, w = problem.table[cone], axis_of(water).scale(problem.table[water])

@@ -1,0 +1,67 @@
+"""Predict with a calibration, or with the corrected models of a diagnosis."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import TYPE_CHECKING, overload
+
+from calib.data import as_table
+from calib.data.reader import Tabular
+from calib.inference.calibration import Calibration
+from calib.validation import prediction
+from calib.validation.prediction import Prediction
+
+if TYPE_CHECKING:
+    from calib.gap.corrected import CorrectedPrediction
+    from calib.gap.diagnose import Diagnosis
+
+
+@overload
+def predict(found: Calibration, at: Tabular) -> Prediction: ...
+@overload
+def predict(
+    found: Diagnosis, at: Tabular, without: Collection[str] = ()
+) -> CorrectedPrediction: ...
+
+
+def predict(
+    found: Calibration | Diagnosis, at: Tabular, without: Collection[str] = ()
+) -> Prediction | CorrectedPrediction:
+    """Predict at the conditions of a table.
+
+    Parameters
+    ----------
+    found : Calibration or Diagnosis
+    at : Table, mapping of str to array_like, or pandas.DataFrame
+        With the conditions, under column names with units. For a diagnosis also the covariates
+        that its causes depend on.
+    without : collection of str, optional
+        Causes of a diagnosis that no longer act, as of an instrument that was mended.
+
+    Returns
+    -------
+    Prediction or CorrectedPrediction
+
+    Raises
+    ------
+    CalibError
+        If a condition is missing, a cause is unknown, or causes are left out of a calibration,
+        which has none.
+
+    Examples
+    --------
+    >>> import calib
+    >>> plates = calib.load_he2019("rut_depth")
+    >>> calibration = calib.calibrate(calib.build_problem("bekker", plates), seed=1)
+    >>> bands = calib.predict(calibration, {"average_ground_pressure_kpa": [100.0, 150.0]})
+    >>> bands.predictive.median.shape
+    (2,)
+    """
+    table = as_table(at)
+    if isinstance(found, Calibration):
+        if without:
+            raise TypeError("a calibration has no causes to leave out")
+        return prediction.predict(found, table)
+    from calib.gap.corrected import predict_corrected  # late: a calibration does without
+
+    return predict_corrected(found.corrected, table, without)

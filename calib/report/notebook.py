@@ -1,0 +1,187 @@
+"""Results as tables, figures and short pages, for a notebook."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import singledispatch
+from html import escape
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from calib.data import Table
+from calib.data.quantities import QUANTITIES, role_of
+from calib.gap.corrected import CorrectedPrediction
+from calib.gap.describe import gap_document
+from calib.gap.diagnose import Diagnosis
+from calib.gap.mixture import UNLISTED
+from calib.inference.calibration import Calibration
+from calib.inference.random import generator
+from calib.report.comparison import comparison_figure
+from calib.report.figures import bands, gap, style
+from calib.report.gap_words import Words
+from calib.report.labels import axis_of, units_of
+from calib.report.rows import Fitted
+from calib.report.verdict import verdict
+from calib.validation.comparison import Comparison
+from calib.validation.prediction import Prediction, band_columns, predictive_draws
+
+
+@singledispatch
+def frame(found: Any) -> pd.DataFrame:
+    """Return a result as a table."""
+    raise TypeError(f"{type(found).__name__} has no table")
+
+
+@frame.register
+def _(found: Table) -> pd.DataFrame:
+    return pd.DataFrame(dict(found.columns), index=pd.Index(found.lines, name="line"))
+
+
+@frame.register
+def _(found: Calibration) -> pd.DataFrame:
+    columns = ["unit", "median", "mean", "sd", "hdi_lower", "hdi_upper", "ess_bulk", "rhat"]
+    # What was sampled, then what is published of it.
+    names = sorted(found.summary, key=lambda name: name not in found.problem.names)
+    rows = {name: [getattr(found.summary[name], c) for c in columns] for name in names}
+    return pd.DataFrame.from_dict(rows, orient="index", columns=columns).rename_axis("parameter")
+
+
+@frame.register
+def _(found: Prediction) -> pd.DataFrame:
+    return pd.DataFrame({**found.conditions, **band_columns(found)})
+
+
+@frame.register
+def _(found: CorrectedPrediction) -> pd.DataFrame:
+    return pd.DataFrame(dict(found.columns))
+
+
+@frame.register
+def _(found: Comparison) -> pd.DataFrame:
+    rows = {
+        c.model: {
+            "weight": found.weights[c.model],
+            "elpd": float(c.rows.sum()),
+            "elpd_behind_best": found.differences[c.model].elpd,
+            "se": found.differences[c.model].se,
+            "sound": c.sound,
+        }
+        for c in found.candidates
+    }
+    return pd.DataFrame.from_dict(rows, orient="index").rename_axis("model")
+
+
+@frame.register
+def _(found: Diagnosis) -> pd.DataFrame:
+    causes = {**found.inclusion.causes, UNLISTED: found.inclusion.residual_discrepancy}
+    rows = {
+        name: {
+            "probability": cause.probability,
+            "share": cause.share,
+            "share_lower": cause.share_interval[0],
+            "share_upper": cause.share_interval[1],
+        }
+        for name, cause in causes.items()
+    }
+    return pd.DataFrame.from_dict(rows, orient="index").rename_axis("cause")
+
+
+@singledispatch
+def figure(found: Any) -> Figure:
+    """Draw the one figure that shows a result."""
+    raise TypeError(f"{type(found).__name__} has no figure")
+
+
+@figure.register
+def _(found: Calibration) -> Figure:
+    problem = found.problem
+    rng = generator(found.seed, found.label, "replicate")
+    _, replicated = predictive_draws(found, problem.conditions, rng)
+    with style.style(), units_of(problem.table.header):
+        return bands.bands_figure(Fitted(found, None, replicated))
+
+
+@figure.register
+def _(found: Prediction) -> Figure:
+    measured = found.predictive
+    return _bars(
+        dict(found.conditions),
+        {found.output: (measured.median, measured.lower[0.9], measured.upper[0.9])},
+    )
+
+
+@figure.register
+def _(found: CorrectedPrediction) -> Figure:
+    columns = found.columns
+    outputs = [name.removesuffix("_after") for name in columns if name.endswith("_after")]
+    shown = {
+        o: tuple(columns[f"{o}_after{end}"] for end in ("", "_lower", "_upper")) for o in outputs
+    }
+    return _bars(dict(found.conditions), shown)
+
+
+@figure.register
+def _(found: Comparison) -> Figure:
+    return comparison_figure(found)
+
+
+@figure.register
+def _(found: Diagnosis) -> Figure:
+    document = gap_document(found)
+    with style.style():
+        drawn = gap.which_plate(document, Words(document)).figure
+    if drawn is None:
+        raise TypeError("there is nothing to draw")
+    return drawn
+
+
+def _bars(conditions: dict[str, Any], shown: dict[str, Any]) -> Figure:
+    """Draw medians and 90 % bars of outputs along slip, or the condition that has most values."""
+    known = {n: v for n, v in conditions.items() if n in QUANTITIES and role_of(n) != "order"}
+    along = max(known, key=lambda n: (role_of(n) == "slip", np.unique(known[n]).size))
+    x = axis_of(along)
+    with style.style():
+        drawn, axes = style.panels(1, len(shown), height=60.0, bottom=14.0, gap_x=16.0)
+        for ax, (output, values) in zip(axes.flat, shown.items(), strict=True):
+            y = axis_of(output)
+            middle, low, high = (y.scale(np.asarray(v)) for v in values)
+            at = x.scale(known[along])
+            ax.vlines(at, low, high, color=style.BLUE, alpha=0.4, linewidth=2.0)
+            ax.plot(at, middle, "o", color=style.BLUE, ms=3.5)
+            ax.set(xlabel=x.label, ylabel=f"{y.label}, 90 % bars")
+    return drawn
+
+
+@singledispatch
+def html(found: Any) -> str:
+    """Return a verdict, where there is one, and the table."""
+    return str(frame(found).to_html(float_format="%.4g", max_rows=20, border=0))
+
+
+@html.register
+def _(found: Calibration) -> str:
+    said = verdict(found)
+    lines = [f"Trust: {said.trust}." * bool(said.trust), f"Not: {said.doubt}." * bool(said.doubt)]
+    return _page(said.headline, lines, found)
+
+
+@html.register
+def _(found: Comparison) -> str:
+    return _page(found.sentence, (), found)
+
+
+@html.register
+def _(found: Diagnosis) -> str:
+    said = Words(gap_document(found)).verdict()
+    facts = dict(said.facts)
+    lines = [f"{label}: {facts[label]}" for label in ("How large", "Next") if label in facts]
+    return _page(said.headline, lines, found)
+
+
+def _page(headline: str, lines: Sequence[str], found: Any) -> str:
+    said = "".join(f"<p>{escape(text)}</p>" for text in lines if text)
+    table = frame(found).head(12).to_html(float_format="%.4g", border=0)
+    return f"<div><p><strong>{escape(headline)}</strong></p>{said}{table}</div>"

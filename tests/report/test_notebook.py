@@ -1,0 +1,113 @@
+"""What results show in a notebook, and tables that come from pandas or a dictionary."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+
+import calib
+from calib.gap.mixture import UNLISTED
+from tests.gap.cases import diagnosis_of
+
+PULLS = ("slip_ratio", "inflation_pressure_psi")
+
+
+@cache
+def calibrated():
+    data = calib.load_he2019("drawbar_pull")
+    return calib.calibrate(calib.build_problem("magic_formula_pressure", data), seed=1)
+
+
+@cache
+def compared():
+    columns = dict(calib.load_he2019("rut_depth").columns)
+    return calib.compare(["bekker", "modified_bekker"], columns)
+
+
+@cache
+def shown():
+    field = diagnosis_of("lug_thrust").data.case.field
+    return [
+        calibrated(),
+        calib.predict(calibrated(), calib.load_he2019("drawbar_pull")),
+        compared(),
+        diagnosis_of("lug_thrust"),
+        calib.predict(diagnosis_of("lug_thrust"), field),
+    ]
+
+
+@pytest.mark.parametrize("i", range(5))
+def test_every_result_has_a_short_name_a_table_a_figure_and_a_view(i):
+    found = shown()[i]
+    assert len(repr(found)) < 300
+    assert isinstance(found.plot(), Figure)
+    frame = found.to_dataframe()
+    assert len(frame) >= 2
+    assert "<table" in found._repr_html_()
+
+
+def test_parameters_come_first_and_then_what_is_published_of_them():
+    found = calibrated()
+    frame = found.to_dataframe()
+    sampled = list(found.problem.names)
+    assert set(frame.index[: len(sampled)]) == set(sampled)
+    assert frame.loc["D_lo", "median"] == found.summary["D_lo"].median
+    assert frame.loc["D_lo", "unit"] == "kN"
+
+
+def test_a_prediction_has_a_row_for_each_row_of_conditions():
+    at = pd.DataFrame({"slip_percent": [5.0, 90.0], "inflation_pressure_psi": [30.0, 30.0]})
+    found = calib.predict(calibrated(), at)
+    frame = found.to_dataframe()
+    np.testing.assert_allclose(frame["slip_ratio"], [0.05, 0.9])
+    np.testing.assert_array_equal(frame["drawbar_pull_kn_median"], found.predictive.median)
+    assert list(frame["outside_calibrated_range"]) == ["", "slip_ratio"]
+
+
+def test_a_diagnosis_predicts_with_its_causes_and_without_them():
+    found = diagnosis_of("lug_thrust")
+    field = pd.DataFrame(dict(found.data.case.field.columns)).drop(columns="drawbar_pull_kn")
+    acting, mended = (
+        calib.predict(found, field, without).to_dataframe()["drawbar_pull_kn_after"]
+        for without in ((), ["lug_thrust"])
+    )
+    truth = found.truth.means["drawbar_pull"]
+    np.testing.assert_allclose(acting, truth, rtol=1e-9)
+    assert (acting - mended).mean() > 0.05
+    with pytest.raises(TypeError, match="no causes"):
+        calib.predict(calibrated(), calib.load_he2019("drawbar_pull"), ["lug_thrust"])
+
+
+def test_a_diagnosis_lists_causes_and_the_unlisted():
+    found = diagnosis_of("lug_thrust")
+    frame = found.to_dataframe()
+    assert frame.index[0] == "lug_thrust"
+    assert UNLISTED in frame.index
+    assert (
+        frame.loc["lug_thrust", "probability"] == found.inclusion.causes["lug_thrust"].probability
+    )
+
+
+def test_a_comparison_lists_models_by_weight():
+    frame = compared().to_dataframe()
+    assert frame["weight"].sum() == pytest.approx(1.0)
+    assert frame.loc["modified_bekker", "elpd_behind_best"] == 0.0
+
+
+def test_a_table_may_be_a_dictionary_or_a_data_frame():
+    table = calib.load_he2019("drawbar_pull")
+    columns = {name: table[name] for name in (*PULLS, "drawbar_pull_kn")}
+    problems = [
+        calib.build_problem("magic_formula_pressure", data)
+        for data in (table, columns, pd.DataFrame(columns))
+    ]
+    start = problems[0].priors.sample(np.random.default_rng(1), 3)
+    values = [problem.log_prob(start) for problem in problems]
+    np.testing.assert_allclose(values[1], values[0])
+    np.testing.assert_allclose(values[2], values[0])
+    rest, held = calib.hold_out(pd.DataFrame(columns), "inflation_pressure_psi", 30)
+    assert (len(rest), len(held)) == (28, 14)
