@@ -77,28 +77,40 @@ app = typer.Typer(
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-_COMMANDS: Mapping[Callable[..., None], str] = {
-    calibration.report: "report my.csv --hold-out inflation_pressure_psi=30 --out report",
-    calibration.fit: "fit my.csv --model magic_formula_pressure --out run",
-    prediction.predict: "predict run --at conditions.csv --out predicted.csv",
-    declared.data: "data he2019-gaps --out cases",
-    declared.template: "template magic_formula_pressure --out my.csv",
-    declared.priors: "priors magic_formula_pressure --out my.toml",
-    declared.models: "models magic_formula",
-    declared.effects: "effects slip_sinkage",
-    declared.quantities: "quantities rut_depth --json",
-    calibration.compare: "compare bekker reece plates.csv --hold-out plate_width_mm=80 "
-    "--out compared",
-    prediction.diagnose: "diagnose --run run --field field.csv --out diagnosis",
-    check.check: "check run --json > check.json",
-    check.audit: "audit --out audit",
-    campaign.campaign: "campaign plan.toml --out results --workers 2",
-    campaign.sbc: "sbc --model bekker --simulations 100 --out sbc",
-    check.doctor: "doctor --quick",
+# Commands with an example each, in groups as the help shows them.
+_COMMANDS: Mapping[str, Mapping[Callable[..., None], str]] = {
+    "Everyday": {
+        calibration.fit: "fit my.csv --model magic_formula_pressure --out run",
+        prediction.predict: "predict run --at conditions.csv --out predicted.csv",
+        calibration.report: "report my.csv --hold-out inflation_pressure_psi=30 --out report",
+        calibration.compare: "compare bekker reece plates.csv --hold-out plate_width_mm=80 "
+        "--out compared",
+        prediction.diagnose: "diagnose --run run --field field.csv --out diagnosis",
+    },
+    "Look up": {
+        declared.models: "models magic_formula",
+        declared.effects: "effects slip_sinkage",
+        declared.quantities: "quantities rut_depth --json",
+        declared.template: "template magic_formula_pressure --out my.csv",
+        declared.priors: "priors magic_formula_pressure --out my.toml",
+        declared.data: "data he2019-gaps --out cases",
+    },
+    "Verify": {
+        check.check: "check run --json > check.json",
+        check.doctor: "doctor --quick",
+        check.audit: "audit --out audit",
+        campaign.sbc: "sbc --model bekker --simulations 100 --out sbc",
+    },
+    "Many runs, and work on calib": {
+        campaign.campaign: "campaign plan.toml --out results --workers 2",
+    },
 }
-for command, example in _COMMANDS.items():
-    app.command(cls=options.Command, epilog=f"Example: calib {example}")(command)
-app.add_typer(campaign.challenge, name="challenge")
+for panel, commands in _COMMANDS.items():
+    for command, example in commands.items():
+        app.command(cls=options.Command, rich_help_panel=panel, epilog=f"Example: calib {example}")(
+            command
+        )
+app.add_typer(campaign.challenge, name="challenge", rich_help_panel=panel)
 
 
 def _version(wanted: bool) -> None:

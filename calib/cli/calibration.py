@@ -25,7 +25,9 @@ def report(
     files: Annotated[
         list[Path] | None, typer.Argument(help="Your CSV files; the embedded data if none.")
     ] = None,
-    out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("calib-report"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")] = Path(
+        "calib-report"
+    ),
     seed: opt.Seed = 2019,
     hold_out: opt.HoldOutOption = None,
     model: Annotated[
@@ -146,7 +148,9 @@ def fit(
     ctx: typer.Context,
     file: Annotated[Path, typer.Argument(help="CSV whose column names carry units.")],
     model: Annotated[str, typer.Option(help="See `calib models`.")],
-    out: Annotated[Path, typer.Option(help="Run folder to write.")] = Path("calib-run"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="Run folder to write.")] = Path(
+        "calib-run"
+    ),
     priors: Annotated[Path | None, typer.Option(help="Prior file; see `calib priors`.")] = None,
     seed: opt.Seed = 2019,
     hold_out: opt.HoldOutOption = None,
@@ -229,7 +233,9 @@ def fit(
 def compare(
     ctx: typer.Context,
     what: Annotated[list[str], typer.Argument(help="Models, then the CSV: A B my.csv.")],
-    out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("calib-comparison"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")] = Path(
+        "calib-comparison"
+    ),
     priors: opt.PriorFiles = None,
     seed: opt.Seed = 2019,
     hold_out: opt.HoldOutOption = None,

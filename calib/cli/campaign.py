@@ -20,9 +20,9 @@ def _tell_failed(failed: Mapping[str, str]) -> None:
 
 def campaign(
     plan: Annotated[Path, typer.Argument(help="TOML file with the tasks: docs/formats/inputs.md.")],
-    out: Annotated[Path, typer.Option(help="Folder of results; resumed if it is there.")] = Path(
-        "calib-campaign"
-    ),
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder of results; resumed if it is there.")
+    ] = Path("calib-campaign"),
     workers: opt.Workers = 2,
     scheduler: opt.Scheduler = None,
     only_list: Annotated[
@@ -62,7 +62,9 @@ def campaign(
 
 
 def sbc(
-    out: Annotated[Path, typer.Option(help="Folder to write; a run there is resumed.")],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder to write; a run there is resumed.")
+    ],
     model: Annotated[
         list[str] | None, typer.Option(help="Model to test; all but slow ones if none; repeatable.")
     ] = None,
@@ -120,7 +122,7 @@ challenge = typer.Typer(
     epilog="Example: calib challenge make --out cases --key key.json --seed 1 --cases 20",
 )
 def make(
-    out: Annotated[Path, typer.Option(help="Folder for the cases.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the cases.")],
     key: Annotated[Path, typer.Option(help="File for the sealed answers, outside it.")],
     seed: opt.Seed,
     cases: Annotated[int, typer.Option(help="How many.", min=1)] = 300,
@@ -148,7 +150,9 @@ def make(
 @challenge.command(cls=opt.Command, epilog="Example: calib challenge run cases --out diagnoses")
 def run(
     folder: _Cases,
-    out: Annotated[Path, typer.Option(help="Folder for the diagnoses; resumed if it is there.")],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder for the diagnoses; resumed if it is there.")
+    ],
     seed: opt.Seed = 1,
     workers: opt.Workers = 2,
     scheduler: opt.Scheduler = None,
@@ -178,7 +182,7 @@ def run(
 def well_specified(
     folder: _Cases,
     key: _Key,
-    out: Annotated[Path, typer.Option(help="Folder for the well-specified cases.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the well-specified cases.")],
     out_key: Annotated[Path, typer.Option(help="File for their answers, outside it.")],
     seed: opt.Seed = 1,
     workers: opt.Workers = 2,
@@ -216,7 +220,9 @@ def score(
     outputs: Annotated[
         str, typer.Option(help="Only cases that measure these, e.g. drawbar_pull,rut_depth.")
     ] = "",
-    out: Annotated[Path | None, typer.Option(help="Folder for the table and figures.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for the table and figures.")
+    ] = None,
     overwrite: opt.Overwrite = False,
     json: opt.Json = False,
 ) -> None:

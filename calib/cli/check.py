@@ -143,7 +143,8 @@ def _short(value: Any) -> str:
 def audit(
     ctx: typer.Context,
     out: Annotated[
-        Path | None, typer.Option(help="Folder for audit.json, audit.csv, figures and a page.")
+        Path | None,
+        typer.Option("--out", "-o", help="Folder for audit.json, audit.csv, figures and a page."),
     ] = None,
     json: opt.Json = False,
     seed: opt.Seed = 2019,

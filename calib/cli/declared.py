@@ -21,7 +21,9 @@ _OneModel = Annotated[str, typer.Argument(help="See `calib models`.")]
 
 def data(
     name: Annotated[str, typer.Argument(help="he2019 or he2019-gaps")],
-    out: Annotated[Path | None, typer.Option(help="Folder to write; its name if none.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder to write; its name if none.")
+    ] = None,
     overwrite: opt.Overwrite = False,
 ) -> None:
     """Write the embedded, reconstructed data as CSV files, or as cases for `calib diagnose`."""
@@ -52,7 +54,9 @@ def data(
 
 def template(
     model: _OneModel,
-    out: Annotated[Path | None, typer.Option(help="CSV to write; printed if none.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="CSV to write; printed if none.")
+    ] = None,
     plugins: opt.Models = None,
     simulator: opt.Simulators = None,
 ) -> None:
@@ -69,7 +73,9 @@ def template(
 
 def priors(
     model: _OneModel,
-    out: Annotated[Path | None, typer.Option(help="TOML to write; printed if none.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="TOML to write; printed if none.")
+    ] = None,
     plugins: opt.Models = None,
     simulator: opt.Simulators = None,
 ) -> None:

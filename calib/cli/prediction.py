@@ -29,7 +29,9 @@ def diagnose(
             help="Folder with a case.toml; its table context takes what is suspected or excluded."
         ),
     ] = None,
-    out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("calib-diagnosis"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")] = Path(
+        "calib-diagnosis"
+    ),
     seed: opt.Seed = 1,
     run: Annotated[Path | None, typer.Option(help="Run folder of `calib fit`.")] = None,
     field: Annotated[Path | None, typer.Option(help="CSV of the field campaign.")] = None,
@@ -140,7 +142,9 @@ def predict(
         Path, typer.Argument(help="Folder of `calib fit`, `calib compare` or `calib diagnose`.")
     ],
     at: Annotated[Path, typer.Option(help="CSV with the conditions.")],
-    out: Annotated[Path | None, typer.Option(help="CSV to write; printed if none.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="CSV to write; printed if none.")
+    ] = None,
     effects: opt.EffectsFile = None,
     without: Annotated[
         list[str] | None,

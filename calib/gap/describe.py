@@ -19,6 +19,7 @@ from calib.data.quantities import OUTPUTS, role_of
 from calib.gap import document as doc
 from calib.gap.campaigns import OutputData, columns_over
 from calib.gap.constants import WORTH_SAYING
+from calib.gap.curves import curves
 from calib.gap.diagnose import Diagnosis, Placebo, assumed, field_parts, placebos
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.fit import Fit
@@ -146,6 +147,7 @@ def gap_document(
         notes=case.notes,
         warnings=tuple(warnings),
         unused=tuple(_unused(found)),
+        curves=curves(found),
         prediction=_prediction(found),
     )
 

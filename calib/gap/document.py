@@ -19,6 +19,7 @@ from scipy.special import betaincinv
 
 from calib.errors import CalibError, in_words
 from calib.gap.corrected import Shrink
+from calib.gap.curves import Curve
 from calib.gap.laboratory_bias import Bias
 from calib.gap.mixture import Region
 from calib.gap.noise import Noise
@@ -424,6 +425,8 @@ class GapDocument:
         known, or no shift is in play.
     doubts : tuple of str
         What the most probable explanation should not leave in the field, each a clause.
+    curves : tuple of Curve
+        Of each output, over the condition that matters.
     prediction : mapping of str to tuple
         Columns of ``fresh_prediction.csv``; empty without conditions to predict.
     """
@@ -481,6 +484,7 @@ class GapDocument:
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     unused: tuple[UnusedRow, ...] = ()
+    curves: tuple[Curve, ...] = ()
     prediction: Mapping[str, tuple[str, ...] | Numbers] = field(default_factory=dict)
 
     @property

@@ -132,7 +132,8 @@ def _(found: Comparison) -> Figure:
 def _(found: Diagnosis) -> Figure:
     document = gap_document(found)
     with style.style():
-        drawn = gap.which_plate(document, Words(document)).figure
+        plate = gap.corrected_plate(document, Words(document))
+        drawn = (plate or gap.which_plate(document, Words(document))).figure
     if drawn is None:
         raise TypeError("there is nothing to draw")
     return drawn

@@ -48,6 +48,37 @@ _NORM = Normalize(0.0, 1.0)
 _SPECIAL = ("none", "unknown", "parameter_shift")
 
 
+# The one figure
+
+
+def corrected_plate(d: GapDocument, say: Words) -> Plate | None:
+    """Draw the field's readings beside the calibrated and the corrected curve."""
+    if not d.curves:
+        return None
+    fig, axes = panels(1, len(d.curves), height=62.0, left=16.0, bottom=21.0, gap_x=18.0)
+    handles: dict[str, Any] = {}
+    for ax, curve in zip(axes.flat, d.curves, strict=True):
+        x, y = say.n.axis(curve.column), say.n.axis(curve.output)
+        at = x.scale(np.array(curve.at))
+        before, after, low, high = (
+            y.scale(np.array(v)) for v in (curve.before, curve.after, curve.lower, curve.upper)
+        )
+        band = ax.fill_between(at, low, high, color=BLUE, alpha=0.2, lw=0.0)
+        (old,) = ax.plot(at, before, color=VERMILION, lw=1.4, ls=(0, (4, 2)))
+        (new,) = ax.plot(at, after, color=BLUE, lw=1.6)
+        where = x.scale(np.array(curve.readings_at)), y.scale(np.array(curve.readings))
+        (dots,) = ax.plot(*where, "o", ms=3.6, color=BLACK, zorder=4, **DOTS)
+        ax.set(xlabel=x.label, ylabel=y.label)
+        handles = {
+            "field readings": dots,
+            "calibrated in the laboratory": old,
+            "corrected": new,
+            "90 % band of the corrected": band,
+        }
+    style.legend_below(fig, handles, 4)
+    return Plate(fig, "corrected", say("caption_corrected"), "The field, before and after")
+
+
 # Where
 
 
@@ -185,8 +216,9 @@ def _key(fig: Figure, *, regions: bool) -> None:
 
 def which_plate(d: GapDocument, say: Words) -> Plate:
     """Draw the probabilities of the hypotheses."""
-    first, others = d.explanations[:8], d.explanations[8:]
-    shown = [*first, *(e for e in others if e.name in _SPECIAL)]
+    # Few enough to be read, none so improbable that its bar has no length.
+    first = [e for e in d.explanations[:8] if e is d.best or e.probability >= 0.01]
+    others, shown = d.explanations[len(first) :], first
     tied = [e for e in first if e.probability >= TIE * d.best.probability]
     # As wide as the margin: longer names, of several causes at once, take two lines or three.
     labels = [textwrap.fill(short_name(e.name), 38) for e in shown]
@@ -210,7 +242,7 @@ def which_plate(d: GapDocument, say: Words) -> Plate:
     if len(tied) > 1:
         read = "read them as a tie" if d.best.probability < 0.5 else "any of them may be right"
         style.note(ax, f"hatched: not far apart,\n{read}", x=0.98, y=0.05, color=BLACK)
-    rest = sum(e.probability for e in others if e.name not in _SPECIAL)
+    rest = sum(e.probability for e in others)
     caption = say("caption_which", tied, len(others), rest)
     return Plate(fig, "which", caption, "Which: the hypotheses")
 
@@ -440,6 +472,7 @@ def _bars(ax: Axes, d: GapDocument, own: OutputRows) -> None:
 
 # In reading order.
 _DRAWINGS: dict[str, Callable[[GapDocument, Words], Plate | None]] = {
+    "corrected": corrected_plate,
     "isolability": isolability_plate,
     "where": where_plate,
     "where_conditions": conditions_plate,

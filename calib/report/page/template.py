@@ -42,8 +42,10 @@ def _known(value: float | None, form: str | int = 3) -> str:
     return form.format(value) if isinstance(form, str) else format_number(value, form)
 
 
-_FILTERS: dict[str, Callable[..., str]] = {
+_FILTERS: dict[str, Callable[..., Any]] = {
     "unbroken": unbroken,
+    # The steps of a text that begins with (1).
+    "steps": lambda text: re.split(r"\s*\(\d\) ", text)[1:] if text.startswith("(1) ") else [],
     "plain": plain,
     "basename": lambda path: PurePosixPath(path).name,
     "joined": joined,
