@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from calib.batch.campaign import read_plan, run_campaign
-    from calib.check.check import check
+    from calib.checking.check import check
     from calib.data import Table, hold_out, read_table, table_from_arrays
     from calib.data.quantities import Quantity, Range
     from calib.data.registry import register
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 _HOME = {
     "calib.batch.campaign": "read_plan run_campaign",
-    "calib.check.check": "check",
+    "calib.checking.check": "check",
     "calib.data": "Table hold_out read_table table_from_arrays",
     "calib.data.quantities": "Quantity Range",
     "calib.data.registry": "register",

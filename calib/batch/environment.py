@@ -1,8 +1,8 @@
 """What numbers depend on beside data, priors and seed: versions, processor, the code itself.
 
 Where these differ, numbers may be rounded otherwise; what that may change is stated in
-`calib.check.tolerances`. One thread of linear algebra, whatever the machine has and the caller has
-set, for several add up in another order; and no floating-point errors.
+`calib.checking.tolerances`. One thread of linear algebra, whatever the machine has and the caller
+has set, for several add up in another order; and no floating-point errors.
 """
 
 from __future__ import annotations

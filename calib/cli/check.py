@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from calib.check.check import Outcome
-    from calib.check.compare import Item
+    from calib.checking.check import Outcome
+    from calib.checking.compare import Item
     from calib.he2019.audit import Audit
 
 _Quick = Annotated[
@@ -57,7 +57,7 @@ def check(
 
 def _checked(folder: Path, quick: bool, workers: int, effects: Path | None = None) -> Outcome:
     from calib.batch.pool import pool
-    from calib.check.check import check as check_folder
+    from calib.checking.check import check as check_folder
     from calib.models.simulators.files import load_files
 
     # A slow simulator is checked as it was emulated: nothing is run.
@@ -70,7 +70,7 @@ def _checked(folder: Path, quick: bool, workers: int, effects: Path | None = Non
 
 def show(outcome: Outcome, *, every: bool) -> None:
     """Print what a check found: every number and file, or only those that are not the same."""
-    from calib.check.compare import Status
+    from calib.checking.compare import Status
 
     console = wide_console()
     console.print(outcome.verdict, soft_wrap=True)
@@ -97,7 +97,7 @@ def _groups(outcome: Outcome) -> Table:
     """One row for each group: how many of its entries are what."""
     from rich.table import Table
 
-    from calib.check.compare import Status
+    from calib.checking.compare import Status
     from calib.data.files import plain_number
 
     table = Table()

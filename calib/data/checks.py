@@ -393,6 +393,14 @@ def hold_out(
     ------
     CalibError
         If no row has that value, listing those present, or if every row has it.
+
+    Examples
+    --------
+    >>> import calib
+    >>> pulls = calib.load_he2019("drawbar_pull")
+    >>> fitted, held_out = calib.hold_out(pulls, "inflation_pressure_psi", 30)
+    >>> len(fitted), len(held_out)
+    (28, 14)
     """
     table, column = as_table(table), parse_header(quantity_header)
     if column is None or column.quantity.canonical not in table:

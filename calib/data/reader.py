@@ -375,6 +375,12 @@ def read_table(
     ------
     CalibError
         Naming file, line, column, what was found, what is expected and how to fix it.
+
+    Examples
+    --------
+    >>> import calib
+    >>> table = calib.read_table("my.csv", required=["slip_ratio"])  # doctest: +SKIP
+    >>> table["slip_ratio"]  # doctest: +SKIP
     """
     file = open_csv(path)
     where, width = f"{file.source}, line {file.header_line}", len(file.header)
@@ -460,6 +466,13 @@ def table_from_arrays(
     ------
     CalibError
         As `read_table` does, with rows counted from 0; also for columns of unequal length.
+
+    Examples
+    --------
+    >>> import calib
+    >>> table = calib.table_from_arrays({"slip_percent": [5, 20], "drawbar_pull_lbf": [90, 210]})
+    >>> table["drawbar_pull_kn"].round(3).tolist()
+    [0.4, 0.934]
     """
     arrays = {name: np.asarray(values) for name, values in columns.items()}
     rows = range(_common_length(arrays, source))

@@ -130,6 +130,15 @@ def register(*declared: Any) -> None:
     ------
     CalibError
         If one is not what it must be, or something else has its name.
+
+    Examples
+    --------
+    >>> import calib
+    >>> from calib.data.quantities import Range
+    >>> belly = calib.Quantity(
+    ...     "belly_clearance_mm", "condition", "length", Range(0.0), word="belly clearance"
+    ... )  # doctest: +SKIP
+    >>> calib.register(belly)  # doctest: +SKIP
     """
     for one in declared:
         if not hasattr(one, "register"):

@@ -176,6 +176,13 @@ def read_case(folder: Path) -> Case:
     ------
     CalibError
         Naming what is missing or wrong, and where.
+
+    Examples
+    --------
+    >>> import calib
+    >>> from pathlib import Path
+    >>> case = calib.read_case(Path("cases/nominal_slip"))  # doctest: +SKIP
+    >>> dict(case.models)  # doctest: +SKIP
     """
     folder = Path(folder)
     path = folder / "case.toml"

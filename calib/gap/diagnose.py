@@ -141,6 +141,12 @@ def diagnose(
     CalibError
         If the case cannot be diagnosed: an output or a condition is missing, too few rows; or
         an effect that is not calib's own does not do what an effect must.
+
+    Examples
+    --------
+    >>> import calib
+    >>> diagnosis = calib.diagnose("cases/nominal_slip")  # doctest: +SKIP
+    >>> diagnosis.to_dataframe().head(3)  # doctest: +SKIP
     """
     if not isinstance(case, Case):
         case = read_case(Path(case))

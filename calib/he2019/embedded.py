@@ -59,7 +59,14 @@ def tables() -> Mapping[str, Mapping[str, Array]]:
 
 
 def load_he2019(output: str) -> Table:
-    """Return the table of bulk_density, drawbar_pull or rut_depth, labelled reconstructed."""
+    """Return the table of bulk_density, drawbar_pull or rut_depth, labelled reconstructed.
+
+    Examples
+    --------
+    >>> import calib
+    >>> calib.load_he2019("drawbar_pull").label
+    'reconstructed'
+    """
     if output not in tables():
         wrong, hint = f"there is no output {output!r}", "name one of these"
         raise CalibError(wrong, expected=", ".join(tables()), hint=hint)

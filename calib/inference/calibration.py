@@ -185,6 +185,16 @@ def calibrate(
     -------
     Calibration
         Read ``converged`` before use.
+
+    Examples
+    --------
+    >>> import calib
+    >>> ruts = calib.load_he2019("rut_depth")
+    >>> calibration = calib.calibrate(calib.build_problem("bekker", ruts), seed=1)
+    >>> calibration.converged
+    True
+    >>> calibration.summary["z_ref"].unit
+    'mm'
     """
     label = label or problem.bound.model.output
     starts = _starts(problem, estimates) if estimates else None

@@ -355,6 +355,16 @@ def estimate(
     Settings are keyword arguments of the method's function, such as
     ``settings=GeneticSettings(NP=100)`` for ``"genetic"``. A CalibError if the method does not
     exist, does not apply to the model, or fails on these data.
+
+    Examples
+    --------
+    >>> import calib
+    >>> ruts = calib.load_he2019("rut_depth")
+    >>> import numpy as np
+    >>> problem = calib.build_problem("bekker", ruts)
+    >>> found = calib.estimate(problem, "least_squares", np.random.default_rng(1))
+    >>> found.converged
+    True
     """
     model = problem.bound.model.name
     if method not in methods_for(model):

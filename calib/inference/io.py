@@ -196,6 +196,15 @@ def to_datatree(calibration: Calibration) -> xr.DataTree:
     Chains are walkers (`sample_stats.ensemble` says of which ensemble), so that effective sample
     sizes computed from the file are those of the gate. Groups: posterior, prior, log_prior,
     posterior_predictive, log_likelihood, sample_stats, observed_data, constant_data.
+
+    Examples
+    --------
+    >>> import calib
+    >>> ruts = calib.load_he2019("rut_depth")
+    >>> calibration = calib.calibrate(calib.build_problem("bekker", ruts), seed=1)
+    >>> tree = calib.to_datatree(calibration)
+    >>> sorted(tree.children)[:3]
+    ['constant_data', 'log_likelihood', 'log_prior']
     """
     import xarray as xr  # late: half a second
 
@@ -355,6 +364,12 @@ def save_calibration(
     ----------
     environment : Environment, optional
         Where it says that it was made: in that of this process by default.
+
+    Examples
+    --------
+    >>> import calib
+    >>> from pathlib import Path
+    >>> calib.save_calibration(calibration, Path("run"))  # doctest: +SKIP
     """
     problem = calibration.problem
     save_posterior(calibration, folder / POSTERIOR)
@@ -382,6 +397,12 @@ def load_calibration(folder: Path) -> Calibration:
     ------
     CalibError
         If the folder is not one, a file in it is damaged, or the model has changed since.
+
+    Examples
+    --------
+    >>> import calib
+    >>> from pathlib import Path
+    >>> calibration = calib.load_calibration(Path("run"))  # doctest: +SKIP
     """
     folder = Path(folder)
     record = read_record(RunRecord, folder)

@@ -349,6 +349,14 @@ def build_problem(
         If a column is missing, or as in another unit; if too few rows are there, all of them at one
         setting of the conditions or with one output; if the priors do not fit the model, leave no
         parameter free, or expect outputs of quite another size.
+
+    Examples
+    --------
+    >>> import calib
+    >>> ruts = calib.load_he2019("rut_depth")
+    >>> problem = calib.build_problem("modified_bekker", ruts)
+    >>> problem.names
+    ('z_ref', 'n0', 'n1', 'sigma')
     """
     model, table = get_model(model_name), as_table(table)
     table.must_have(*model.conditions, model.output)

@@ -406,7 +406,14 @@ class Words:
 
 
 def gap_verdict(found: Diagnosis | GapDocument) -> GapVerdict:
-    """Say in a headline and a few sentences what a diagnosis found; nothing is drawn."""
+    """Say in a headline and a few sentences what a diagnosis found; nothing is drawn.
+
+    Examples
+    --------
+    >>> import calib
+    >>> diagnosis = calib.diagnose("cases/nominal_slip")  # doctest: +SKIP
+    >>> calib.gap_verdict(diagnosis).headline  # doctest: +SKIP
+    """
     return Words(found if isinstance(found, GapDocument) else gap_document(found)).verdict()
 
 

@@ -268,6 +268,14 @@ def verdict(
         Why the emulator that stood in for a simulator, if one did, is not good enough.
     held_out : str
         What the rows have in common that were held out, for instance a column and its value.
+
+    Examples
+    --------
+    >>> import calib
+    >>> ruts = calib.load_he2019("rut_depth")
+    >>> calibration = calib.calibrate(calib.build_problem("bekker", ruts), seed=1)
+    >>> calib.verdict(calibration).headline
+    'A column explains the residuals'
     """
     output = output_of(calibration.problem.bound.model.output)
     prior = prior_predictive(calibration.problem, generator(calibration.seed, output, "prior"))

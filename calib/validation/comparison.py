@@ -191,6 +191,14 @@ def compare(
     ----------
     Vehtari, Gelman & Gabry (2017), doi:10.1007/s11222-016-9696-4; Yao, Vehtari, Simpson & Gelman
     (2018), doi:10.1214/17-BA1091; Sivula, Magnusson, Matamoros & Vehtari (2020), arXiv:2008.10296.
+
+    Examples
+    --------
+    >>> import calib
+    >>> ruts = calib.load_he2019("rut_depth")
+    >>> comparison = calib.compare(["bekker", "modified_bekker"], ruts)
+    >>> comparison.sentence
+    'The data prefer modified_bekker to bekker.'
     """
     check_comparable(models)
     given, table = priors or {}, as_table(table)

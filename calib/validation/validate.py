@@ -84,6 +84,16 @@ def validate_held_out(calibration: Calibration, held_out: Tabular) -> Validation
     -----
     A parameter vector for which the equation has no value at one of the rows (a quadratic in
     pressure that is negative beyond the calibrated ones) is left out.
+
+    Examples
+    --------
+    >>> import calib
+    >>> pulls = calib.load_he2019("drawbar_pull")
+    >>> fitted, held_out = calib.hold_out(pulls, "inflation_pressure_psi", 30)
+    >>> problem = calib.build_problem("magic_formula_pressure", fitted)
+    >>> calibration = calib.calibrate(problem, seed=1)
+    >>> calib.validate_held_out(calibration, held_out).method
+    'held_out'
     """
     model, held_out = calibration.problem.bound.model, as_table(held_out)
     rng = generator(calibration.seed, calibration.label, "validate")
@@ -128,6 +138,14 @@ def leave_one_out(
     References
     ----------
     Vehtari, Gelman & Gabry (2017), doi:10.1007/s11222-016-9696-4.
+
+    Examples
+    --------
+    >>> import calib
+    >>> ruts = calib.load_he2019("rut_depth")
+    >>> calibration = calib.calibrate(calib.build_problem("bekker", ruts), seed=1)
+    >>> calib.leave_one_out(calibration, refit=False).method
+    'leave_one_out'
     """
     problem = calibration.problem
     t = calibration.draws.flat

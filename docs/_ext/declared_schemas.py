@@ -7,7 +7,7 @@ from typing import Any
 from result_schemas import RESULTS
 
 from calib.batch.campaign.kinds import KINDS
-from calib.check.check import Manifest
+from calib.checking.check import Manifest
 from calib.inference.io import RunRecord
 from calib.inference.prior_files import PriorFileContent
 from calib.models.simulators.files import SimulatorFile

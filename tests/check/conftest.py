@@ -18,11 +18,11 @@ from unittest.mock import patch
 
 import pytest
 
-import calib.check.check as check_module
+import calib.checking.check as check_module
 from calib.batch.environment import sha256
-from calib.check import compare, folders, tolerances
-from calib.check.check import Outcome, check, recompute_report
-from calib.check.compare import Status
+from calib.checking import compare, folders, tolerances
+from calib.checking.check import Outcome, check, recompute_report
+from calib.checking.compare import Status
 from calib.gap.diagnose import diagnose
 from calib.he2019 import sections
 from calib.he2019.audit import run_audit

@@ -15,8 +15,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from calib.batch.environment import sha256
-from calib.check.check import check
-from calib.check.compare import Status
+from calib.checking.check import check
+from calib.checking.compare import Status
 from calib.data import read_table
 from calib.errors import CalibError
 from calib.models import example_csv

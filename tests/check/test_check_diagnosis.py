@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from calib.check.check import check
-from calib.check.compare import Status
+from calib.checking.check import check
+from calib.checking.compare import Status
 from calib.cli.app import app
 from calib.errors import CalibError
 from calib.he2019.gaps import paper_gaps, write_cases

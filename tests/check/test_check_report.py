@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from calib.batch.environment import sha256
-from calib.check.check import check
-from calib.check.compare import Status
+from calib.checking.check import check
+from calib.checking.compare import Status
 from calib.errors import CalibError
 from calib.inference.prior_files import default_priors
 from tests.check.conftest import (

@@ -10,9 +10,9 @@ import h5py
 import numpy as np
 import pytest
 
-from calib.check import folders
-from calib.check.check import check
-from calib.check.compare import Status
+from calib.checking import folders
+from calib.checking.check import check
+from calib.checking.compare import Status
 from calib.errors import CalibError
 from calib.inference.calibration import calibrate
 from calib.inference.io import load_calibration, save_calibration

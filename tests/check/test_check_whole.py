@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from calib.check.check import check
-from calib.check.compare import Status
+from calib.checking.check import check
+from calib.checking.compare import Status
 from calib.he2019.audit import audit_csv
 from tests.check.conftest import different, edit_json, findings, in_text, seal, swap_figures
 

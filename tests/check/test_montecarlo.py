@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from scipy.stats import norm
 
-from calib.check.compare import Status, compare_entries, flatten
-from calib.check.tolerances import (
+from calib.checking.compare import Status, compare_entries, flatten
+from calib.checking.tolerances import (
     drawn_in_output,
     drawn_in_run,
     multiple,

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calib.check.compare import Item, Status, compare_entries, flatten, without_numbers
+from calib.checking.compare import Item, Status, compare_entries, flatten, without_numbers
 
 FILE = "summary.json"
 POSTERIOR = (FILE, "models", "rut_depth", "posterior", "n1")

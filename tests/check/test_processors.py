@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.check.check import check
+from calib.checking.check import check
 from calib.gap.forward import Forward
 from calib.inference import sampler as sampler_module
 from calib.inference.problem import Problem

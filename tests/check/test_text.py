@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from calib.batch.environment import Environment
-from calib.check import compare
-from calib.check.compare import Item, Job, Status
+from calib.checking import compare
+from calib.checking.compare import Item, Job, Status
 
 
 def shown(picture: bytes) -> str:

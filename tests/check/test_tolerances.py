@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from calib.check.compare import SUMMARY, Status, compare_entries, flatten
-from calib.check.tolerances import TABLE, compiled, tolerance_of
+from calib.checking.compare import SUMMARY, Status, compare_entries, flatten
+from calib.checking.tolerances import TABLE, compiled, tolerance_of
 from tests.gap_files import gap_files
 
 REPORT = Path(__file__).resolve().parents[2] / "reports" / "he2019"

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from calib.check.check import Outcome
-from calib.check.compare import Item, Status
-from calib.check.tolerances import MONTE_CARLO
+from calib.checking.check import Outcome
+from calib.checking.compare import Item, Status
+from calib.checking.tolerances import MONTE_CARLO
 from calib.cli.check import show
 from calib.errors import CalibError
 from calib.he2019 import embedded

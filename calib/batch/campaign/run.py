@@ -66,6 +66,12 @@ def read_plan(path: Path) -> Plan:
     ------
     CalibError
         Naming table and key, what is expected there and how to fix it.
+
+    Examples
+    --------
+    >>> import calib
+    >>> from pathlib import Path
+    >>> plan = calib.read_plan(Path("plan.toml"))  # doctest: +SKIP
     """
     path = Path(path)
     text, content = _read(path)
@@ -336,6 +342,13 @@ def run_campaign(
     CalibError
         If the folder is not one of a campaign, holds results of something else, or there is no
         such cluster.
+
+    Examples
+    --------
+    >>> import calib
+    >>> from pathlib import Path
+    >>> plan = calib.read_plan(Path("plan.toml"))  # doctest: +SKIP
+    >>> calib.run_campaign(plan, Path("results"), workers=2)  # doctest: +SKIP
     """
     out, results = Path(out), Path(out) / "results"
     check_names(plan.tasks)

@@ -107,6 +107,11 @@ def run_audit(
         Called with what is being done, steps done and steps planned.
     pool : Executor, optional
         Where searches run; the numbers do not depend on it.
+
+    Examples
+    --------
+    >>> import calib
+    >>> audit = calib.run_audit()  # doctest: +SKIP
     """
     tell = progress or (lambda what, done, planned: None)
     seeds = seeds or Seeds()

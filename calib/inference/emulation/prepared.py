@@ -207,6 +207,15 @@ def emulated(
     ------
     CalibError
         If the model is no simulator's.
+
+    Examples
+    --------
+    >>> import calib
+    >>> simulator = calib.read_simulator("wheel.toml")  # doctest: +SKIP
+    >>> calib.register(simulator)  # doctest: +SKIP
+    >>> data = calib.read_table("lab.csv")  # doctest: +SKIP
+    >>> emulation = calib.emulated(calib.build_problem("wheel", data), seed=1)  # doctest: +SKIP
+    >>> calibration = calib.calibrate(emulation.problem, seed=1)  # doctest: +SKIP
     """
     problem.noise.must_be_iid_normal(problem.priors.source, "an emulator")
     found = _simulated(problem.bound.model.name)

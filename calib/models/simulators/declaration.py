@@ -328,6 +328,24 @@ def from_callable(
     ------
     CalibError
         If the priors are not valid TOML, or a column names no known quantity.
+
+    Examples
+    --------
+    >>> import calib
+    >>> import numpy as np
+    >>> def pull(theta, x):
+    ...     return theta[:, :1] * x["normal_load_kn"] * (1.0 - np.exp(-8.0 * x["slip_ratio"]))
+    >>> priors = '''
+    ... [parameters]
+    ... mu = {dist = "half_normal", sd = 1.0, unit = "1", reason = "soils", source = "Wong"}
+    ... sigma = {dist = "half_normal", sd = 0.2, unit = "kN", reason = "cell", source = "ours"}
+    ... '''
+    >>> simulator = calib.from_callable(
+    ...     pull, name="my_wheel", parameters=priors, conditions=["slip_ratio", "normal_load_kn"],
+    ...     output="drawbar_pull_kn",
+    ... )
+    >>> simulator.models
+    ('my_wheel',)
     """
     named = {output: output} if isinstance(output, str) else dict(output)
     taken = dict(conditions) if isinstance(conditions, Mapping) else {c: c for c in conditions}

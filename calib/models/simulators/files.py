@@ -97,6 +97,12 @@ def read_simulator(path: Path) -> Simulated:
 
     A CalibError names the file and the key: it is not TOML, a key is unknown, missing or
     impossible, a parameter has no prior, the command does not exist, or a template lacks a place.
+
+    Examples
+    --------
+    >>> import calib
+    >>> from pathlib import Path
+    >>> calib.register(calib.read_simulator(Path("wheel.toml")))  # doctest: +SKIP
     """
     path = Path(path).resolve()
     try:

@@ -13,7 +13,7 @@ import pytest
 from calib.batch.campaign import read_plan, run_campaign
 from calib.batch.campaign.kinds import KINDS
 from calib.batch.folders import check_folder
-from calib.check.check import check
+from calib.checking.check import check
 from calib.cli.prediction import prepare_case
 from calib.data import hold_out, read_table
 from calib.gap.batch import diagnose_cases

@@ -7,7 +7,7 @@ text, flags and counts must be equal where no row says otherwise. The kinds:
 - arithmetic: by sums and closed forms, which processors round otherwise in the last bits.
 - optimum: where a deterministic search stopped, off by a small part of a posterior sd.
 - random search: one comparison of nearly equal costs that falls the other way sends it elsewhere.
-- Monte Carlo: of posterior draws, which may be others (`calib.check.tolerances.multiple`).
+- Monte Carlo: of posterior draws, which may be others (`calib.checking.tolerances.multiple`).
 - diagnosis: of evidence and importance sampling with recorded seeds, which rounding moves where a
   draw changes sides of a threshold; a part of its own sd, or of one in probability.
 - order of magnitude: how the work went, not what was found.

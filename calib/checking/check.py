@@ -16,8 +16,8 @@ from pydantic import Field, model_validator
 
 from calib.batch.environment import Environment, sha256, unix_lines
 from calib.batch.pool import HERE
-from calib.check import compare, folders
-from calib.check.compare import (
+from calib.checking import compare, folders
+from calib.checking.compare import (
     INPUTS,
     LINE_ENDS,
     MANIFEST,
@@ -29,13 +29,13 @@ from calib.check.compare import (
     Status,
     claim,
 )
-from calib.check.folders import (
+from calib.checking.folders import (
     DiagnosisRecord,
     check_comparison,
     check_diagnosis,
     check_run,
 )
-from calib.check.tolerances import describe, drawn_in_output
+from calib.checking.tolerances import describe, drawn_in_output
 from calib.data import has_rows, read_table
 from calib.data.files import inside, read_json
 from calib.data.quantities import OUTPUTS
@@ -91,6 +91,13 @@ def check(
     ------
     CalibError
         If it cannot be checked: the folder is none of ours, or does not say how it was made.
+
+    Examples
+    --------
+    >>> import calib
+    >>> from pathlib import Path
+    >>> calib.check(Path("run")).exit_code  # doctest: +SKIP
+    0
     """
     folder = Path(folder)
     record = read_folder(folder)

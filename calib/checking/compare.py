@@ -25,7 +25,7 @@ import numpy as np
 
 from calib.batch.environment import Environment, sha256, unix_lines
 from calib.batch.pool import HERE
-from calib.check.tolerances import (
+from calib.checking.tolerances import (
     MONTE_CARLO,
     ORDER_OF_MAGNITUDE,
     Entries,

@@ -14,9 +14,9 @@ import numpy as np
 from pydantic import Field
 
 from calib.batch.environment import Environment, differs_in_lines, sha256, unix_lines
-from calib.check import compare
-from calib.check.compare import FIGURES, INPUTS, LINE_ENDS, PAGE, TEXT, Item, Job, Status, claim
-from calib.check.tolerances import drawn_in_comparison, drawn_in_run
+from calib.checking import compare
+from calib.checking.compare import FIGURES, INPUTS, LINE_ENDS, PAGE, TEXT, Item, Job, Status, claim
+from calib.checking.tolerances import drawn_in_comparison, drawn_in_run
 from calib.data import Table
 from calib.data import files as data_files
 from calib.data.files import decoded, inside
