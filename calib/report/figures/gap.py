@@ -218,7 +218,9 @@ def which_plate(d: GapDocument, say: Words) -> Plate:
     """Draw the probabilities of the hypotheses."""
     # Few enough to be read, none so improbable that its bar has no length.
     first = [e for e in d.explanations[:8] if e is d.best or e.probability >= 0.01]
-    others, shown = d.explanations[len(first) :], first
+    special = [e for e in d.explanations[8:] if e.name in _SPECIAL and e.probability >= 0.01]
+    shown = [*first, *special]
+    others = [e for e in d.explanations if e not in shown]
     tied = [e for e in first if e.probability >= TIE * d.best.probability]
     # As wide as the margin: longer names, of several causes at once, take two lines or three.
     labels = [textwrap.fill(short_name(e.name), 38) for e in shown]

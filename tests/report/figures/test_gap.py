@@ -102,7 +102,7 @@ def test_bars_have_the_numbers(drawn):
     assert heights == pytest.approx([0.11, 0.04])
 
 
-def test_a_tie_is_hatched_and_special_hypotheses_are_always_shown():
+def test_a_tie_is_hatched_and_probable_special_hypotheses_are_shown():
     many = {f"e{i}": 0.1 for i in range(9)} | {"none": 0.05, "unknown": 0.05}
     (plate,) = gap_plates(document("ambiguous", many), ["which"])
     (ax,) = plate.figure.axes

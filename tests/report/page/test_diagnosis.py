@@ -132,7 +132,7 @@ def test_a_folder_is_in_the_units_of_the_files_checks_and_is_rendered_again(tmp_
     units = set(re.findall(r"[\d.]+ (mm|psi|kPa|m/s|kN)\b", reader.text))
     assert units == {"kN", "mm", "kPa", "psi"}
     # The ground pressure is in the file's psi.
-    assert re.findall(r".{7}[\d.]+ psi\b", reader.text) == ["18 and 42 psi", "8.5 to 28.2 psi"]
+    assert {"18 and 42 psi", "8.5 to 28.2 psi"} < {*re.findall(r".{7}[\d.]+ psi\b", reader.text)}
     figures = [p.figure for p in gap_plates(load_document(out))]
     labels = {text.get_text() for f in figures for text in f.findobj(Text)}
     assert {"Gap in drawbar pull (N)", "Gap in rut depth (inch)", "Speed\n(ft/s)"} <= labels
