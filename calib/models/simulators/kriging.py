@@ -195,10 +195,7 @@ class Region:
 
 @dataclass(frozen=True)
 class Over:
-    """Interpolates curves over conditions about a trend that is linear in them.
-
-    By a Matern 5/2 process, its length scales by likelihood: between few values of a condition it
-    goes straight, where a constant mean would draw the curve to itself.
+    """Interpolates curves over conditions (Matern 5/2, its length scales by likelihood).
 
     `columns` are the conditions that vary, `low` and `width` (c,) the nodes' box, `nodes` (m, c)
     and `lengths` (c,) in units of the box, `fixed` the conditions that do not vary.
@@ -212,17 +209,10 @@ class Over:
     fixed: Mapping[str, float]
 
     def weights(self, curves: Array) -> Array:
-        """Return what `at` needs of curves at the nodes, shape (j, m) to (m + p, j)."""
-        trend, factor = self._trend(self.nodes), self._factor()
-        spread = cho_solve(factor, trend)
-        # Conditions may go together.
-        slopes = np.linalg.pinv(trend.T @ spread) @ (spread.T @ curves.T)
-        return np.concatenate([cho_solve(factor, curves.T - trend @ slopes), slopes])
-
-    def _trend(self, u: Array) -> Array:
-        """Return a constant and, where there are nodes enough, slopes at points, (n, p)."""
-        one = np.ones((len(u), 1))
-        return np.hstack([one, u]) if len(self.nodes) > u.shape[1] + 2 else one
+        """Return what `at` needs of curves at the nodes, shape (j, m) to (m + 1, j)."""
+        mean = curves.mean(axis=1)
+        solved = cho_solve(self._factor(), (curves - mean[:, None]).T)
+        return np.concatenate([solved, mean[None]])
 
     def at(self, conditions: Mapping[str, Array], weights: Array) -> Array:
         """Return curves at conditions (n,) or (k, n), shape (..., j); NaN too far outside."""
@@ -232,7 +222,7 @@ class Over:
         for name, value in self.fixed.items():
             off |= np.abs(conditions[name] - value) > 1e-6 * max(1.0, abs(value))
         if not self.columns:
-            only = weights[-1] + weights[: len(self.nodes)].sum(axis=0)
+            only = weights[-1] + weights[:-1].sum(axis=0)
             found = np.broadcast_to(only, (*shape, weights.shape[1]))
         else:
             raw = [np.broadcast_to(conditions[name], shape).ravel() for name in self.columns]
@@ -254,8 +244,7 @@ class Over:
         return found
 
     def _smooth(self, u: Array, weights: Array) -> Array:
-        near, m = _matern(u, self.nodes, self.lengths), len(self.nodes)
-        return np.asarray(near @ weights[:m] + self._trend(u) @ weights[m:])
+        return np.asarray(_matern(u, self.nodes, self.lengths) @ weights[:-1] + weights[-1])
 
     def _factor(self) -> tuple[Array, bool]:
         if not self.columns:
@@ -270,12 +259,9 @@ class Over:
         """Return the errors at each node were it not one, shape (j, m) to (j, m)."""
         if not self.columns or len(self.nodes) < 3:
             return np.zeros_like(curves)
-        factor, trend = self._factor(), self._trend(self.nodes)
-        spread = cho_solve(factor, trend)
-        # What the trend takes up of each node is found again without it (Dubrule 1983).
-        inverse = cho_solve(factor, np.eye(len(self.nodes)))
-        inverse -= spread @ np.linalg.pinv(trend.T @ spread) @ spread.T
-        return np.asarray(curves @ inverse / np.diag(inverse))
+        inverse = cho_solve(self._factor(), np.eye(len(self.nodes)))
+        centred = curves - curves.mean(axis=1, keepdims=True)
+        return np.asarray(centred @ inverse / np.diag(inverse))
 
 
 def _matern(a: Array, b: Array, lengths: Array) -> Array:
@@ -302,12 +288,13 @@ def over_conditions(
 def _lengths(u: Array, curves: Array) -> Array:
     from sklearn.gaussian_process.kernels import ConstantKernel, Matern
 
-    trend = (
-        np.hstack([np.ones((len(u), 1)), u]) if len(u) > u.shape[1] + 2 else np.ones((len(u), 1))
+    spread = curves.std(axis=1, keepdims=True)
+    scaled = ((curves - curves.mean(axis=1, keepdims=True)) / np.where(spread > 0, spread, 1.0)).T
+    # No shorter than from one value of a condition to the next: between few, curves would fall back
+    # to their mean.
+    shortest = [max(1.0 / (np.unique(v.round(9)).size - 1), 0.03) for v in u.T]
+    kernel = ConstantKernel(1.0, (1e-1, 1e5)) * Matern(
+        np.maximum(0.5, shortest), [(low, 20.0) for low in shortest], 2.5
     )
-    left = curves - curves @ np.linalg.pinv(trend).T @ trend.T
-    spread = left.std(axis=1, keepdims=True)
-    scaled = (left / np.where(spread > 0, spread, 1.0)).T
-    kernel = ConstantKernel(1.0, (1e-1, 1e5)) * Matern(np.full(u.shape[1], 0.5), (0.03, 20.0), 2.5)
     found = fitted_kernel(kernel, u, scaled, NUGGETS_OVER[-1])
     return np.asarray(np.atleast_1d(found.k2.length_scale) * np.ones(u.shape[1]))

@@ -222,3 +222,14 @@ def test_a_condition_that_did_not_vary_is_not_guessed() -> None:
     found = over.at(x, weights)[:, 0]
     assert np.isfinite(found[0])
     assert np.isnan(found[1])
+
+
+def test_between_two_values_of_a_condition_curves_do_not_fall_back_to_their_mean():
+    """Ruts that depend on load alone, at two loads: nothing else says how far a load reaches."""
+    slip, load = (v.ravel() for v in np.meshgrid([0.05, 0.1, 0.2, 0.3, 0.45, 0.6], [0.6, 1.2]))
+    exponents = np.linspace(0.5, 0.9, 12)[:, None]
+    curves = 40.0 * load**exponents + np.random.default_rng(3).normal(0.0, 0.02, (12, 12))
+    over = over_conditions({"slip": slip, "load": load}, curves)
+    at = np.linspace(0.6, 1.2, 7)
+    found = over.at({"slip": np.full(7, 0.25), "load": at}, over.weights(curves))
+    np.testing.assert_allclose(found, (40.0 * at**exponents).T, rtol=0.05)
