@@ -18,7 +18,13 @@ try:
 except metadata.PackageNotFoundError:  # a checkout that is not installed
     release = ""
 
-extensions = ["myst_parser", "mathml", "declared"]
+extensions = [
+    "myst_parser", "mathml", "declared", "sphinx.ext.autodoc", "sphinx.ext.napoleon",
+]  # fmt: skip
+autodoc_typehints = "none"
+autodoc_preserve_defaults = True
+napoleon_use_param = False
+napoleon_use_rtype = False
 exclude_patterns = ["_ext"]
 myst_enable_extensions = ["dollarmath", "colon_fence", "deflist", "attrs_block"]
 myst_heading_anchors = 3
