@@ -10,6 +10,7 @@ from scipy import stats
 
 from calib.data import Table, table_from_arrays
 from calib.errors import CalibError
+from calib.gap.campaigns import campaigns
 from calib.gap.case import case_from_run
 from calib.inference.calibration import calibrate
 from calib.inference.estimators import estimate
@@ -106,11 +107,11 @@ def test_it_is_kept_and_named_and_refused_where_it_is_not_known(tmp_path: Path) 
     t = found.draws.flat[:5]
     np.testing.assert_allclose(again.log_likelihood(t), problem.log_likelihood(t), rtol=1e-9)
     field = tmp_path / "field.csv"
-    field.write_text(
-        "slip_ratio,average_ground_pressure_kpa,rut_depth_mm\n0.1,120,21\n0.2,130,25\n"
-    )
-    with pytest.raises(CalibError, match="a diagnosis takes normal noise of one standard"):
-        case_from_run(tmp_path / "run", field)
+    readings = "".join(f"0.{i},1{i}0,2{i}\n" for i in range(1, 8))
+    field.write_text(f"slip_ratio,average_ground_pressure_kpa,rut_depth_mm\n{readings}")
+    case = case_from_run(tmp_path / "run", field)
+    with pytest.raises(CalibError, match="run_order, a column that is not there"):
+        campaigns(case)
 
 
 @pytest.mark.parametrize(
