@@ -134,6 +134,7 @@ def report(
     for key, failure in study.failures.items():
         print(f"{key}: FAILED: {failure.error}", file=sys.stderr)
     print(page)
+    print(f"next: open that page; calib check {out} computes it again")
     converged = all(r.calibration.converged for r in study.successes.values())
     for record in (s.record(part) for s, part in found.parts if s.name == "comparison"):
         tell_compared(record)
@@ -226,6 +227,10 @@ def fit(
         }  # fmt: skip
     tell_verdict(judged)
     print(f"run folder: {out}")
+    follow = f"calib predict {out} --at CONDITIONS.csv"
+    if held is not None:
+        follow = "fit all rows, without --hold-out, and predict from that run"
+    print(f"next: {follow if calibration.converged else 'raise --max-steps, and fit again'}")
     good = calibration.converged and all(e.passed for e in emulations.values())
     finish(0 if good else 3, out / "run.json", **found)
 
@@ -283,6 +288,7 @@ def compare(
     tell_compared(written)
     print(text(written))
     print(out / "index.html")
+    print(f"next: calib predict {out} --at CONDITIONS.csv")
     good = found.sound and all(e.passed for e in emulations.values())
     finish(0 if good else 3, written, folder=str(out))
 
