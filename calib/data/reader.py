@@ -12,6 +12,7 @@ import logging
 import math
 import os
 import re
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -37,7 +38,7 @@ class Frame(Protocol):
 
 
 # What stands for a table: columns by names with units, as in a file.
-type Tabular = Table | Mapping[str, ArrayLike] | Frame
+type Tabular = Table | Mapping[str, ArrayLike] | Frame | str | os.PathLike[str]
 
 _log = logging.getLogger(__name__)
 
@@ -502,17 +503,17 @@ def table_from_arrays(
 
 
 def as_table(data: Tabular) -> Table:
-    """Return a table as it is; make one of a mapping or a data frame.
+    """Return a table as it is; read a file; make a table of a mapping or a data frame.
 
     Parameters
     ----------
-    data : Table, mapping of str to array_like, or pandas.DataFrame
+    data : Table, path of a CSV, mapping of str to array_like, or pandas.DataFrame
         Column names with units, as in a file, to values.
 
     Raises
     ------
     CalibError
-        As `table_from_arrays` does.
+        As `table_from_arrays` and `read_table` do; also for anything else, or a column given twice.
 
     Examples
     --------
@@ -521,7 +522,23 @@ def as_table(data: Tabular) -> Table:
     """
     if isinstance(data, Table):
         return data
-    return table_from_arrays({str(name): values for name, values in data.items()})
+    if isinstance(data, str | os.PathLike):
+        return read_table(data)
+    if not hasattr(data, "items"):
+        raise CalibError(
+            f"{type(data).__name__} is no table",
+            expected="a table, the path of a CSV, a dictionary of columns, or a pandas DataFrame",
+            hint="give columns by their names with units",
+        )
+    pairs = [(str(name), values) for name, values in data.items()]
+    twice = [name for name, count in Counter(name for name, _ in pairs).items() if count > 1]
+    if twice:
+        raise CalibError(
+            f"a column is given twice: {twice[0]}",
+            expected="each column once",
+            hint="drop one of them",
+        )
+    return table_from_arrays(dict(pairs))
 
 
 def _common_length(arrays: Mapping[str, NDArray[Any]], source: str) -> int:

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from calib.data.files import plain_number
 from calib.data.quantities import QUANTITIES, UNITS, Quantity, convert
 from calib.errors import CalibError
+from calib.shown import Shown
 
 # A column such as drawbar_pull_sd or slip_angle_deg is about a quantity without being it.
 _QUALIFIERS = frozenset({
@@ -345,8 +346,8 @@ def _guess(header: str, known: Mapping[str, Quantity], cutoff: float, shortened:
 MAX_TEXT_ROWS = 10_000
 
 
-@dataclass(frozen=True, eq=False)
-class Table:
+@dataclass(frozen=True, eq=False, repr=False)
+class Table(Shown):
     """Rows of one data set; every quantity in its canonical unit.
 
     Parameters
@@ -396,6 +397,13 @@ class Table:
             dict(self.columns), self.source, self.lines, self.header, self.text, self.sha256,
             self.label, self.ignored, self.extra,
         )  # fmt: skip
+
+    def __repr__(self) -> str:
+        """Name the source, and say how many rows and which columns there are."""
+        label = f", {self.label}" if self.label else ""
+        names = list(self.columns)
+        more = f" and {len(names) - 6} more" if len(names) > 6 else ""
+        return f"<Table {self.source}{label}: {len(self)} rows of {', '.join(names[:6])}{more}>"
 
     def __len__(self) -> int:
         return len(self.lines)

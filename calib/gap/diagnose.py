@@ -109,7 +109,7 @@ class Diagnosis(Shown):
         """Name the case, the verdict and the most probable hypotheses."""
         p = self.ranking.probability
         best = ", ".join(f"{name} {p[name]:.3f}" for name in self.ranking.order[:3])
-        return f"Diagnosis({self.data.case.name}: {self.verdict}; {best})"
+        return f"<Diagnosis of {self.data.case.name}: {self.verdict}; {best}>"
 
 
 def diagnose(

@@ -135,7 +135,9 @@ def _same_place(field: Table) -> Iterator[str]:
             continue
         whole = np.column_stack([field[column] for column in field])
         first = np.unique(whole, axis=0, return_index=True)[1]
-        _, place, count = np.unique(field[name][first], return_inverse=True, return_counts=True)
+        # In each run by itself, where runs are labelled.
+        order = np.column_stack([field[c] for c in (name, "run") if c in field])[first]
+        _, place, count = np.unique(order, axis=0, return_inverse=True, return_counts=True)
         shared = np.zeros(len(field), dtype=np.bool_)
         shared[first] = count[place] > 1
         if shared.any():

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, overload
 
 from calib.data import as_table
 from calib.data.reader import Tabular
+from calib.errors import CalibError
 from calib.inference.calibration import Calibration
 from calib.validation import prediction
 from calib.validation.prediction import Prediction
@@ -60,8 +61,13 @@ def predict(
     table = as_table(at)
     if isinstance(found, Calibration):
         if without:
-            raise TypeError("a calibration has no causes to leave out")
+            raise CalibError(
+                "a calibration has no causes to leave out",
+                expected="a diagnosis",
+                hint="predict with the diagnosis, or leave `without` out",
+            )
         return prediction.predict(found, table)
     from calib.gap.corrected import predict_corrected  # late: a calibration does without
 
-    return predict_corrected(found.corrected, table, without)
+    left_out = [without] if isinstance(without, str) else without
+    return predict_corrected(found.corrected, table, left_out)

@@ -356,9 +356,12 @@ def describe_estimates(estimates: Sequence[PointEstimate]) -> list[dict[str, Any
 
 
 def save_calibration(
-    calibration: Calibration, folder: Path, *, environment: Environment | None = None
+    calibration: Calibration,
+    folder: str | Path,
+    *,
+    environment: Environment | None = None,
 ) -> None:
-    """Write a run folder into an existing, empty folder.
+    """Write a run folder.
 
     Parameters
     ----------
@@ -371,7 +374,8 @@ def save_calibration(
     >>> from pathlib import Path
     >>> calib.save_calibration(calibration, Path("run"))  # doctest: +SKIP
     """
-    problem = calibration.problem
+    problem, folder = calibration.problem, Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
     save_posterior(calibration, folder / POSTERIOR)
     (folder / PRIORS).write_text(problem.priors.text, encoding="utf-8")
     write_table(folder / DATA, problem.table.whole())

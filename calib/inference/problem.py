@@ -127,7 +127,7 @@ def _expected(problem: Problem) -> tuple[float, float]:
 type _Given = Callable[[Serial, Array, Array], tuple[Array, Array]]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Problem:
     """Calibration data, a bound model and priors.
 
@@ -150,6 +150,11 @@ class Problem:
     priors: Priors
     notes: tuple[str, ...] = ()
     noise: Noise = IID_NORMAL
+
+    def __repr__(self) -> str:
+        """Name the model, and say how many rows and free parameters there are."""
+        rows, free = len(self.table), ", ".join(self.names)
+        return f"<Problem of {self.bound.model.name} on {rows} rows; free: {free}>"
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -27,6 +27,7 @@ from calib.report.rows import Fitted
 from calib.report.verdict import verdict
 from calib.validation.comparison import Comparison
 from calib.validation.prediction import Prediction, band_columns, predictive_draws
+from calib.validation.validate import Validation
 
 
 @singledispatch
@@ -57,6 +58,13 @@ def _(found: Prediction) -> pd.DataFrame:
 @frame.register
 def _(found: CorrectedPrediction) -> pd.DataFrame:
     return pd.DataFrame(dict(found.columns))
+
+
+@frame.register
+def _(found: Validation) -> pd.DataFrame:
+    low, middle, high = np.nanquantile(found.draws, [0.05, 0.5, 0.95], axis=0)
+    columns = {"observed": found.observed, "median": middle, "90_lower": low, "90_upper": high}
+    return pd.DataFrame(columns, index=pd.Index(found.table.lines, name="line"))
 
 
 @frame.register
@@ -184,5 +192,5 @@ def _(found: Diagnosis) -> str:
 
 def _page(headline: str, lines: Sequence[str], found: Any) -> str:
     said = "".join(f"<p>{escape(text)}</p>" for text in lines if text)
-    table = frame(found).head(12).to_html(float_format="%.4g", border=0)
+    table = frame(found).to_html(float_format="%.4g", max_rows=40, border=0)
     return f"<div><p><strong>{escape(headline)}</strong></p>{said}{table}</div>"

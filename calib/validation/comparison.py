@@ -200,7 +200,7 @@ def compare(
     >>> comparison.sentence
     'The data prefer modified_bekker to bekker.'
     """
-    check_comparable(models)
+    check_comparable([models] if isinstance(models, str) else models)
     given, table = priors or {}, as_table(table)
     return compare_problems(
         [build_problem(name, table, given.get(name)) for name in models], seed,

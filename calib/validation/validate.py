@@ -24,13 +24,14 @@ from calib.inference.problem import Problem
 from calib.inference.random import generator, stream
 from calib.inference.sampler import Progress, SamplerSettings, sample_posterior
 from calib.models.base import Array
+from calib.shown import Shown
 from calib.validation.constants import LEVELS, N_DRAWS, PARETO_K_MAX, RELATIVE_ERROR_FAR
 from calib.validation.prediction import predictive_draws
 from calib.validation.scores import Scores, crps, score
 
 
-@dataclass(frozen=True)
-class Validation:
+@dataclass(frozen=True, repr=False)
+class Validation(Shown):
     """Scores on rows that were not fitted.
 
     Parameters
@@ -64,6 +65,14 @@ class Validation:
     elpd_se: float = float("nan")
     unconverged: tuple[int, ...] = ()
     elpd_rows: Array | None = None
+
+    def __repr__(self) -> str:
+        """Say how the rows were kept apart, and how the predictions did."""
+        ninety = self.scores.coverage[0.9]
+        return (
+            f"<Validation ({self.method}): 90 % band covers {ninety.hits} of {ninety.n}, "
+            f"RMSE {self.scores.rmse:.3g}>"
+        )
 
 
 @one_thread()

@@ -151,6 +151,8 @@ def test_it_is_said_that_rows_depend_on_each_other_unless_the_noise_says_so():
         "Rows depend on each other"
     ]
     assert not any(diagnosed(None, seed, asked=True).doubts for seed in range(4))
+    # Places in the order are of each run by itself.
+    assert not [w for w in diagnosed(None, 0, asked=True).warnings if "same run_order" in w]
 
 
 def test_an_order_is_needed_in_the_field_too():

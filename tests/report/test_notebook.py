@@ -78,7 +78,7 @@ def test_a_diagnosis_predicts_with_its_causes_and_without_them():
     truth = found.truth.means["drawbar_pull"]
     np.testing.assert_allclose(acting, truth, rtol=1e-9)
     assert (acting - mended).mean() > 0.05
-    with pytest.raises(TypeError, match="no causes"):
+    with pytest.raises(calib.CalibError, match="no causes"):
         calib.predict(calibrated(), calib.load_he2019("drawbar_pull"), ["lug_thrust"])
 
 
@@ -111,3 +111,31 @@ def test_a_table_may_be_a_dictionary_or_a_data_frame():
     np.testing.assert_allclose(values[2], values[0])
     rest, held = calib.hold_out(pd.DataFrame(columns), "inflation_pressure_psi", 30)
     assert (len(rest), len(held)) == (28, 14)
+
+
+def test_tables_problems_and_validations_are_short_too(tmp_path):
+    table = calib.load_he2019("drawbar_pull")
+    _, held = calib.hold_out(table, "inflation_pressure_psi", 30)
+    validation = calib.validate_held_out(calibrated(), held)
+    for found in (table, calibrated().problem, validation):
+        assert len(repr(found)) < 300
+    assert len(table.to_dataframe()) == len(table)
+    frame = validation.to_dataframe()
+    np.testing.assert_array_equal(frame["observed"], held["drawbar_pull_kn"])
+    assert "<table" in validation._repr_html_()
+    calib.save_calibration(calibrated(), str(tmp_path / "new" / "run"))
+    again = calib.build_problem(
+        "magic_formula_pressure", str(tmp_path / "new" / "run" / "data.csv")
+    )
+    assert len(again.table) == len(calibrated().problem.table)
+
+
+def test_what_is_no_table_is_refused_with_what_would_be_one():
+    for given in (None, 3, np.zeros((2, 2))):
+        with pytest.raises(calib.CalibError, match="is no table"):
+            calib.build_problem("bekker", given)
+    twice = pd.DataFrame([[0.1, 0.2]], columns=["slip_ratio", "slip_ratio"])
+    with pytest.raises(calib.CalibError, match="given twice"):
+        calib.predict(calibrated(), twice)
+    with pytest.raises(calib.CalibError, match="bekker"):
+        calib.compare("bekker", calib.load_he2019("rut_depth"))
