@@ -285,7 +285,10 @@ def _predict_corrected(
     outside = _say_outside(table, covered(corrected, table), [str(row) for row in flags])
     of_outputs = [v for n, v in columns.items() if n.endswith(("_before", "_after"))]
     if nowhere := int(np.isnan(np.array(of_outputs, dtype=np.float64)).any(axis=0).sum()):
-        announce(f"no value (nan) at {nowhere} of {len(table)} rows: the simulator has none there")
+        announce(
+            f"no value (nan) at {nowhere} of {len(table)} rows: the simulator has none there, or "
+            "explanations differ too much"
+        )
     _give(columns, out, *campaigns)
     finish(0, {"columns": _numbers(columns)}, outside=outside)
 

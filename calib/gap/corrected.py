@@ -416,10 +416,11 @@ def predict_new(truth: Truth, before: Mapping[str, Array]) -> dict[str, NewPredi
     found = {}
     for name, values in truth.truth.items():
         after = truth.mean(values)
-        # Where the simulator has no value, the correction of it is none either.
-        no_value = np.isnan(before[name] + after)
-        band = (truth.quantile(truth.measured[name], q) for q in (0.05, 0.95))
-        of_it = (np.where(no_value, np.nan, part) for part in (after, *band))
+        low, high = (truth.quantile(truth.measured[name], q) for q in (0.05, 0.95))
+        # Where the simulator has no value, the correction of it is none either; nor is a mean that
+        # a few extreme draws make.
+        no_value = np.isnan(before[name] + after) | (after < low) | (after > high)
+        of_it = (np.where(no_value, np.nan, part) for part in (after, low, high))
         found[name] = NewPrediction(before[name], *of_it)
     return found
 

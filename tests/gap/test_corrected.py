@@ -482,4 +482,4 @@ def test_a_folder_will_do_and_the_answer_is_short(tmp_path):
     folder = write_case(case, tmp_path / "offset")
     few = {"force_offset": EFFECTS["force_offset"]}
     found = diagnose(folder, 1, effects=few)
-    assert re.fullmatch(r"Diagnosis\(offset: effect; force_offset [\d.]+, .+\)", repr(found))
+    assert re.fullmatch(r"<Diagnosis of offset: effect; force_offset [\d.]+, .+>", repr(found))
