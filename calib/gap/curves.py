@@ -51,7 +51,7 @@ class Curve:
 
 
 def curves(found: Diagnosis) -> tuple[Curve, ...]:
-    """Draw what the one figure of a diagnosis shows, where models have values all along."""
+    """Return the curves of each output whose models have a value all along."""
     drawn = (_curve(found, o, _what_matters(found, o)) for o in found.data.outputs)
     return tuple(curve for curve in drawn if curve is not None)
 
