@@ -226,6 +226,12 @@ class OutputData:
         """The physical role by which effects know the output."""
         return physical_role(self.name)
 
+    def lab_residuals(self, mode: Array) -> Array:
+        """Return the residuals of the laboratory's fit at a vector of its priors, shape (n,)."""
+        natural = self.priors.to_natural(mode[None])
+        predicted = self.problem.bound.mean_response(natural, self.problem.conditions)[0]
+        return np.asarray(self.problem.response - predicted)
+
 
 @dataclass(frozen=True)
 class Campaigns:

@@ -9,7 +9,7 @@ A folder with a ``case.toml``::
     drawbar_pull = "magic_formula"
     [priors]                           # optional: a prior file of the folder, by output
     [covariates]                       # optional: recorded conditions that no simulator takes
-    tyre_temperature_c = "number"
+    tyre_age_weeks = "number"
     operator = "category"              # or its values, ["A. Lind", "B. Berg"]
     [context]                          # optional: what is known before the diagnosis
     same_soil = true

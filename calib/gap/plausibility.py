@@ -310,7 +310,7 @@ def _noisier(data: Campaigns, o: OutputData, mode: Array, best: Fit) -> Iterable
     noise, left = best.noise[o.name], o.problem.response.size - len(o.priors.free)
     if left < 1:
         return
-    lab = _lab_residuals(o, mode)
+    lab = o.lab_residuals(mode)
     of_lab, of_field = data.whitenings(o, noise)
     field = of_field.decorrelated(best.field_residuals[o.name])
     variance = float(np.square(of_lab(lab)).sum()) / left
@@ -354,12 +354,6 @@ def _patterns(data: Campaigns, o: OutputData, ranking: Ranking, best: Fit) -> It
     )
 
 
-def _lab_residuals(o: OutputData, mode: Array) -> Array:
-    natural = o.priors.to_natural(mode[None])
-    predicted = o.problem.bound.mean_response(natural, o.problem.conditions)[0]
-    return np.asarray(o.problem.response - predicted)
-
-
 def _dependent(data: Campaigns, o: OutputData, mode: Array, best: Fit) -> Iterator[Check]:
     """Whether neighbours along the runs of either campaign are alike.
 
@@ -368,7 +362,7 @@ def _dependent(data: Campaigns, o: OutputData, mode: Array, best: Fit) -> Iterat
     if o.along is not None:
         return
     field = data.case.field.take(o.rows)
-    both = (o.problem.table, _lab_residuals(o, mode)), (field, best.field_residuals[o.name])
+    both = (o.problem.table, o.lab_residuals(mode)), (field, best.field_residuals[o.name])
     for table, residual in both:
         place = next((table[c] for c in columns_of("order") if c in table), None)
         if place is None or not np.ptp(residual) > 0.0:

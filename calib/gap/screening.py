@@ -255,7 +255,7 @@ def _without_lab_outliers(data: Campaigns, seed: int) -> tuple[Campaigns, Lab, l
     for _ in range(MOST_ROUNDS):
         far = {}
         for o in data.outputs:
-            z = _lab_residuals(o, lab[0][o.name])
+            z = _robust_residuals(o, lab[0][o.name])
             found = np.abs(z) > LAB_OUTLIER
             if 0 < found.sum() <= _most(z.size):
                 measured = np.flatnonzero(np.isfinite(case.lab[OUTPUTS[o.name]]))
@@ -269,9 +269,8 @@ def _without_lab_outliers(data: Campaigns, seed: int) -> tuple[Campaigns, Lab, l
     return data, lab, said
 
 
-def _lab_residuals(o: OutputData, mode: Array) -> Array:
+def _robust_residuals(o: OutputData, mode: Array) -> Array:
     """Residuals of the laboratory fit in robust sds, shape (n,)."""
-    theta = o.priors.to_natural(mode[None])
-    residual = o.problem.response - o.problem.bound.mean_response(theta, o.problem.conditions)[0]
+    residual = o.lab_residuals(mode)
     robust = 1.4826 * float(np.median(np.abs(residual - np.median(residual))))
     return np.asarray(residual / max(robust, 1e-12))

@@ -113,7 +113,7 @@ def test_spellings(header: str, canonical: str, unit: str) -> None:
 @pytest.mark.parametrize(
     "header",
     [
-        "", "matric_suction_cm", "operator", "slip_angle_deg", "drawbar_pull_sd_kn",
+        "", "matric_suction_cm", "operator", "yaw_rate_deg_s", "drawbar_pull_sd_kn",
         "drawbar_pull_kn_lower", "wheel_speed_rpm", "pass_number_note", "slippery_ratio",
     ],
 )  # fmt: skip

@@ -437,8 +437,9 @@ def case_with(folder, name, lab, field, kind, gap=None):
         cells = [name, *values(len(rows) - 1)]
         with (folder / file).open("w", newline="") as write:
             csv.writer(write).writerows([*row, cell] for row, cell in zip(rows, cells, strict=True))
-    with (folder / "case.toml").open("a") as file:
-        file.write(f"\n[covariates]\n{name} = {kind}\n")
+    if kind:
+        with (folder / "case.toml").open("a") as file:
+            file.write(f"\n[covariates]\n{name} = {kind}\n")
     return folder
 
 
@@ -459,22 +460,45 @@ def saved(found, tmp_path):
 def test_a_number_that_the_simulator_ignores_is_found(tmp_path):
     u = (temperatures(36) - 20.0) / 10.0
     folder = case_with(
-        tmp_path / "case", "tyre_temperature_c", lambda n: np.full(n, 20.0), temperatures,
+        tmp_path / "case", "tyre_age_weeks", lambda n: np.full(n, 20.0), temperatures,
         '"number"', 0.35 * u,
     )  # fmt: skip
     found = diagnose_once(read_case(folder), 1, effects=FEW)
-    assert found.inclusion.causes["depends_on_tyre_temperature_c"].probability > 0.9
-    assert found.ranking.order[0] == "depends_on_tyre_temperature_c"
+    assert found.inclusion.causes["depends_on_tyre_age_weeks"].probability > 0.9
+    assert found.ranking.order[0] == "depends_on_tyre_age_weeks"
     regions = document(found)["regions"]
-    stretches = [r["conditions"].get("tyre_temperature_c") for r in regions]
+    stretches = [r["conditions"].get("tyre_age_weeks") for r in regions]
     # Warm tyres pull more than simulated; stretches are known to one of eight groups.
     assert any(s and 20.0 < s[0] < s[1] and s[1] > 28.0 for s in stretches)
     again = saved(found, tmp_path)
-    assert again.data.case.covariates == {"tyre_temperature_c": ()}
+    assert again.data.case.covariates == {"tyre_age_weeks": ()}
     at = predict_columns(again, read_table(folder / "field.csv"))
     before, after = at[f"{PULL}_before"], at[f"{PULL}_after"]
     warm = temperatures(36) > 27.0
     assert (after[warm] > before[warm]).all()
+
+
+@pytest.mark.parametrize(
+    ("stem", "column", "usual", "low", "high"),
+    [
+        ("camber_angle", "camber_angle_deg", 0.0, -5.0, 10.0),
+        ("steering_angle", "slip_angle_rad", 0.0, -0.1, 0.2),
+        ("tyre_temperature", "tread_temperature_c", 20.0, 12.0, 60.0),
+        ("gravity", "gravity_m_s2", 9.81, 1.6, 9.81),
+        ("tyre_diameter", "wheel_diameter_m", 0.8, 0.4, 1.2),
+    ],
+)  # fmt: skip
+def test_a_recorded_condition_of_the_wheel_is_a_cause_without_being_declared(
+    tmp_path, stem, column, usual, low, high
+):
+    values = np.linspace(low, high, 36)[np.random.default_rng(3).permutation(36)]
+    scaled = 2.0 * (values - usual) / (high - low)
+    folder = case_with(
+        tmp_path / "case", column, lambda n: np.full(n, usual), lambda n: values[:n], "",
+        0.3 * scaled,
+    )  # fmt: skip
+    found = diagnose_once(read_case(folder), 1, effects=FEW)
+    assert found.inclusion.causes[f"depends_on_{stem}"].probability > 0.9
 
 
 def test_a_category_is_found_and_kept_by_its_names(tmp_path):
