@@ -29,6 +29,7 @@ from calib.gap.ranking import Ranking, calibrate_lab
 from calib.inference.proposal import systematic
 
 type Array = np.ndarray
+EVEN, ODD = slice(0, None, 2), slice(1, None, 2)
 
 
 def ln_evidence(forward: Forward, particles: int, rng: np.random.Generator) -> tuple[float, Array]:
@@ -58,24 +59,26 @@ def ln_evidence(forward: Forward, particles: int, rng: np.random.Generator) -> t
         picked = systematic(np.exp(ln_weight - logsumexp(ln_weight)), particles, rng)
         psi, prior, likelihood = psi[picked], prior[picked], likelihood[picked]
         power = following
-        # More steps than coordinates take to mix.
+        # More steps than coordinates take to mix. Each half of the particles is moved by the
+        # covariance of the other: by their own they would draw together.
         for _ in range(20 + 2 * psi.shape[1]):
-            spread = np.cov(psi, rowvar=False).reshape(psi.shape[1], -1)
-            root = np.linalg.cholesky(spread + 1e-9 * np.diag(np.diag(spread) + 1e-12))
-            length = scale * 2.38 / np.sqrt(psi.shape[1])
-            moved = psi + length * rng.standard_normal(psi.shape) @ root.T
-            prior_there = forward.log_prior(moved)
-            inside = np.isfinite(prior_there)
-            there = np.full(particles, -1e300)
-            if inside.any():
-                there[inside] = ln_likelihood(moved[inside])
-            gain = np.where(inside, prior_there, -np.inf) - prior
-            gain = gain + power * (there - likelihood)
-            taken = np.log(rng.random(particles)) < gain
-            psi[taken], prior[taken], likelihood[taken] = (
-                moved[taken], prior_there[taken], there[taken],
-            )  # fmt: skip
-            scale *= float(np.exp(taken.mean() - 0.234))
+            for half, other in (EVEN, ODD), (ODD, EVEN):
+                spread = np.cov(psi[other], rowvar=False).reshape(psi.shape[1], -1)
+                root = np.linalg.cholesky(spread + 1e-9 * np.diag(np.diag(spread) + 1e-12))
+                length = scale * 2.38 / np.sqrt(psi.shape[1])
+                moved = psi[half] + length * rng.standard_normal(psi[half].shape) @ root.T
+                prior_there = forward.log_prior(moved)
+                there = np.full(len(moved), -1e300)
+                inside = np.isfinite(prior_there)
+                if inside.any():
+                    there[inside] = ln_likelihood(moved[inside])
+                gain = np.where(inside, prior_there, -np.inf) - prior[half]
+                gain = gain + power * (there - likelihood[half])
+                taken = np.log(rng.random(len(moved))) < gain
+                psi[half] = np.where(taken[:, None], moved, psi[half])
+                prior[half] = np.where(taken, prior_there, prior[half])
+                likelihood[half] = np.where(taken, there, likelihood[half])
+                scale *= float(np.exp(0.5 * (taken.mean() - 0.234)))
     return ln_z, psi
 
 
