@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from pydantic import Field
 
@@ -42,10 +43,10 @@ from calib.models import get_model
 from calib.models.base import Array
 from calib.report.figures import style
 from calib.report.figures.style import mark, png_bytes
-from calib.report.labels import aligned, axis_of, units_of
+from calib.report.labels import Axis, aligned, axis_of, units_of
 from calib.report.numbers import finite, format_number
-from calib.report.page.template import data_uri, template
-from calib.report.sections import Section, Target
+from calib.report.page.template import data_uri, equation, template
+from calib.report.sections import Section, Target, coverage_words
 from calib.report.study import Progress, Study, Task, fitted_rows
 from calib.report.verdict import Verdict, keep_verdict, kept_verdict, verdict
 from calib.report.writer import file_hashes, own_names
@@ -60,6 +61,7 @@ from calib.validation.comparison import (
 )
 from calib.validation.constants import N_DRAWS, PARETO_K_MAX
 from calib.validation.scores import Scores
+from calib.validation.validate import Validation
 
 
 def comparison_figure(comparison: Comparison) -> Figure:
@@ -83,6 +85,8 @@ def comparison_figure(comparison: Comparison) -> Figure:
             (dots,) = ax.plot(place, y.factor * loo.observed, ".", color=style.BLACK, ms=3.0)
             handles = {"measured": dots, "median without the row": dash}
             handles["90 % interval without the row"] = bars
+            if candidate.held is not None:
+                _draw_held(ax, candidate.held, (x, y), column, handles)
             weight = comparison.weights[candidate.model]
             ax.set(title=f"{candidate.model}, weight {weight:.2f}", xlabel=x.label)
         style.hide_rest(axes, len(candidates))
@@ -92,12 +96,38 @@ def comparison_figure(comparison: Comparison) -> Figure:
     return figure
 
 
+def _draw_held(
+    ax: Axes, held: Validation, axes: tuple[Axis, Axis], column: str, handles: dict[str, Any]
+) -> None:
+    """Draw the rows that were held out, ringed, and the intervals in which they were expected."""
+    x, y = axes
+    place = _spread(x.factor * held.table[column])
+    low, high = y.factor * np.nanquantile(held.draws, [0.05, 0.95], axis=0)
+    ax.vlines(place, low, high, color=style.VERMILION, alpha=0.35, linewidth=1.6)
+    look: Any = {"ms": 4.0, "mfc": "white", "mec": style.VERMILION, "mew": 1.0}
+    (handles["held out"],) = ax.plot(place, y.factor * held.observed, "o", **look)
+
+
 def _main_condition(comparison: Comparison) -> str:
-    """Return the condition of all models that has most values."""
-    models = [c.calibration.problem.bound.model for c in comparison.candidates]
-    table = comparison.candidates[0].loo.table
-    shared = [n for n in models[0].conditions if all(n in m.conditions for m in models)]
-    return max(shared or models[0].conditions, key=lambda n: np.unique(table[n]).size)
+    """Return the condition along which the two best models' predictions of a row differ most.
+
+    By how much of the difference of log densities a parabola in its ranks takes up.
+    """
+    first, second = comparison.candidates[:2]
+    table = first.loo.table
+    named = dict.fromkeys(n for c in (first, second) for n in c.calibration.problem.conditions)
+    shared = [n for n in named if all(n in c.loo.table for c in comparison.candidates)]
+    difference = first.rows - second.rows
+
+    def taken_up(name: str) -> float:
+        _, place = np.unique(table[name], return_inverse=True)
+        if place.max() < 1:
+            return -1.0
+        design = np.vander(place / place.max(), min(3, int(place.max()) + 1))
+        fitted = design @ np.linalg.lstsq(design, difference, rcond=None)[0]
+        return float(np.var(fitted))
+
+    return max(shared, key=taken_up)
 
 
 def _spread(x: Array) -> Array:
@@ -154,11 +184,33 @@ def text(found: Mapping[str, Any]) -> str:
     return "\n".join([*aligned([head, *body]), found["verdict"]])
 
 
+def _one_is_best(found: Mapping[str, Any]) -> bool:
+    """Whether the best model is told apart from all others."""
+    return all(m["told_apart"] for m in list(found["models"].values())[1:])
+
+
+def _coverage_off(found: Mapping[str, Any]) -> Iterator[str]:
+    """Say of which models the 90 % band covers more or fewer rows than it should."""
+    for name, m in found["models"].items():
+        held = m.get("held_out") if found["held_out"] else None
+        for share, n, rows in (
+            (m["coverage_90"], found["rows"], "left-out"),
+            *([(held["coverage_90"], held["rows"], "held-out")] if held else []),
+        ):
+            said = coverage_words(share, n)
+            if not said.endswith("should be"):
+                yield f"{name}: of {n} {rows} rows the 90 % band covers {said}"
+
+
 def page(found: Mapping[str, Any], image: bytes) -> str:
     """Return the page of a comparison, from the content of `comparison.json` and the figure."""
     head, body = table(found)
+    tone = "no" if not found["converged"] else "fine" if _one_is_best(found) else "even"
     return template("comparison.html.j2").render(
         found=found,
+        tone=tone,
+        coverage=list(_coverage_off(found)),
+        equation=equation,
         data_label=found.get("data_label", ""),
         head=head,
         rows=body,

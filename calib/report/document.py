@@ -22,10 +22,9 @@ from calib.report.numbers import finite
 from calib.report.reference import Reference, reference_of
 from calib.report.rows import held_table, x_column
 from calib.report.study import HoldOut, OutputResult, Study
-from calib.report.verdict import judge_evidence
+from calib.report.verdict import checks_passed, judge_evidence
 from calib.validation.comparison import NoisePreference
 from calib.validation.constants import CONTRACTION_MIN, SENSITIVITY_MIN
-from calib.validation.scores import role
 
 
 def summarise(study: Study) -> dict[str, Any]:
@@ -309,7 +308,7 @@ def page_facts(result: OutputResult, emulator_fails: Sequence[str] = ()) -> dict
     return {
         "evidence": evidence,
         "verdict": judge_evidence(evidence),
-        "roles": {name: role(result.calibration, name) for name in result.calibration.summary},
+        "checks": checks_passed(evidence),
         "judged": int(judged.sum()),
         "worst": {} if worst is None else {c: v.table[c][worst] for c in problem.conditions},
         "along": x_column(result),

@@ -41,7 +41,7 @@ from calib.validation.prediction import (
     prior_predictive,
 )
 from calib.validation.residuals import Check, Range, Remark, failed
-from calib.validation.scores import MOVED, PRIOR, role, standardise
+from calib.validation.scores import PRIOR_SET, standardise
 from calib.validation.validate import Validation
 
 
@@ -215,15 +215,26 @@ _FAILS = {
 }
 
 
-def judge_evidence(e: Evidence) -> Verdict:
-    """Apply the rules."""
+def _family(e: Evidence) -> tuple[Check, ...]:
+    """Return the checks that have a probability, which are judged together."""
     coverage = Remark(_words("coverage", e=e), "Bands too narrow")
     pattern = Remark(_words("pattern", e=e), "Curve misses a pattern", True)
     signs_p = binomial_p(e.sign_changes, e.neighbours, 0.5)
+    return (*e.checks, Check(e.low_coverage_p, coverage), Check(signs_p, pattern))
+
+
+def checks_passed(e: Evidence) -> tuple[int, int]:
+    """Return how many checks of rows, priors and bands pass, and how many there are."""
+    family = _family(e)
+    return len(family) - len(failed(family)), len(family)
+
+
+def judge_evidence(e: Evidence) -> Verdict:
+    """Apply the rules."""
     emulated = (_words("emulator", failure=why) for why in e.emulator_fails)
     remarks = [Remark(text, "Emulator not good enough", True) for text in emulated]
     remarks += e.remarks
-    remarks += failed([*e.checks, Check(e.low_coverage_p, coverage), Check(signs_p, pattern)])
+    remarks += failed(_family(e))
     if e.prior_hits < EXPECTED * e.prior_n:
         remarks.append(Remark(_words("surprise", e=e), "Data and priors disagree", True))
     remarks.sort(key=lambda remark: not remark.title)
@@ -333,7 +344,7 @@ def gather(
             held_out=held is not None,
             **_unseen(problem, v),
             unit=axis_of(model.output).unit,
-            prior_set=[p for p in problem.names if role(calibration, p) in (PRIOR, MOVED)],
+            prior_set=[p for p in problem.names if calibration.summary[p].sd_ratio > PRIOR_SET],
             two_pressures=fitted_at.size == 2,
             sign_changes=changes,
             neighbours=neighbours,

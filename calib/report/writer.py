@@ -19,7 +19,7 @@ from calib.batch.folders import fresh_folder
 from calib.batch.pool import HERE
 from calib.data import Table, write_table
 from calib.data.files import read_text
-from calib.inference.estimators import GeneticSettings
+from calib.inference.estimators import GeneticSettings, method_name
 from calib.inference.io import save_posterior
 from calib.inference.prior_files import default_priors
 from calib.inference.sampler import SamplerSettings
@@ -27,11 +27,12 @@ from calib.models import MODELS, get_model
 from calib.models.simulators.emulator import emulator_of, save_emulator
 from calib.report.document import Output, outputs, page_facts, summarise
 from calib.report.figures.collect import Drawn, draw
+from calib.report.labels import joined, plain
 from calib.report.markup import prose, to_html
 from calib.report.numbers import TIMES
 from calib.report.page.template import equation, parametrisation, picture, template
 from calib.report.publish import Publication, likelihood, publication
-from calib.report.publish.tables import TICK, TOPICS
+from calib.report.publish.tables import TICK, TOPICS, parameters_table
 from calib.report.sections import Report, Section, Target, emulation_words
 from calib.report.study import OutputResult, Progress, Study, Task, silent
 from calib.report.verdict import Level
@@ -235,6 +236,16 @@ def _cell(text: str, ticks: bool = False) -> Markup:
     return body + Markup('<span class="tick">{}</span>').format(tick) if ticks else body
 
 
+def identified_words(o: Output) -> str:
+    """Say in a line which sampled parameters the data do not identify."""
+    known = o.found["prior_sensitivity"]["parameters"]
+    sampled = [s.name for s in o.posterior if s.sd_ratio == s.sd_ratio and s.name in known]
+    unknown = [plain(name) for name in sampled if not known[name]["identified"]]
+    if not unknown:
+        return f"the data identify all {len(sampled)} parameters"
+    return f"the data do not identify {joined(unknown)}, so their priors decide"
+
+
 def _section(o: Output, result: OutputResult, drawn: Drawn | None) -> dict[str, Any]:
     """Return what the template shows of an output."""
     bound, verdict = result.calibration.problem.bound, o.facts["verdict"]
@@ -254,6 +265,9 @@ def _section(o: Output, result: OutputResult, drawn: Drawn | None) -> dict[str, 
         "likelihood": to_html(likelihood(o)),
         "parametrisation": said(parametrisation(bound.model.parametrisation, bound.references)),
         "tables": {name: topic.of_output(o) for name, topic in TOPICS.items()},
+        "parameters": parameters_table(o),
+        "identified": said(identified_words(o)),
+        "methods": joined([method_name(m) for m in o.found["estimates"]]) or "none",
         "figures": {
             p.name: {
                 **picture(p, drawn.files.get(f"{o.key}_{p.name}.png", b""), said(p.caption)),

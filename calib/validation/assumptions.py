@@ -90,7 +90,7 @@ def parameter_remarks(calibration: Calibration, remarks: Sequence[Remark]) -> di
     far = {} if best is None else _far_off(calibration, best)
     found = {}
     for name, s in calibration.summary.items():
-        said = ["set by the prior"] * (s.sd_ratio > 0.9)
+        said = ["not identified"] * (s.sd_ratio > PRIOR_SET)
         if name in pressed:
             said.append(f"pressed against its bound {plain_number(pressed[name])}")
         if name in far:

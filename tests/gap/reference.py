@@ -4,7 +4,7 @@ Each explanation in play is drawn again, over all its coordinates, by likelihood
 Monte Carlo (Del Moral, Doucet & Jasra 2006, doi:10.1111/j.1467-9868.2006.00553.x): particles of the
 prior are reweighted with the likelihood to a small power more, resampled, and moved by random walks
 with their own covariance. Nothing is linearised, integrated out or guessed. An evidence has an
-error of some 0.2 nats with 800 particles, of 0.1 with 4000.
+error of some 0.15 nats with 1000 particles.
 """
 
 from __future__ import annotations
@@ -83,11 +83,11 @@ def ln_evidence(forward: Forward, particles: int, rng: np.random.Generator) -> t
 
 
 def _following(power: float, likelihood: Array) -> float:
-    """Return the power at which seven tenths of the particles still count."""
+    """Return the power at which nine tenths of the particles still count."""
 
     def left(following: float) -> float:
         ln = (following - power) * likelihood
-        most = 0.7 * likelihood.size
+        most = 0.9 * likelihood.size
         return float(np.exp(2.0 * logsumexp(ln) - logsumexp(2.0 * ln))) - most
 
     return 1.0 if left(1.0) >= 0.0 else float(brentq(left, power, 1.0))
@@ -137,7 +137,7 @@ def main() -> None:
     """Print both, by hypothesis and by cause."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("case", type=Path)
-    parser.add_argument("--particles", type=int, default=4000)
+    parser.add_argument("--particles", type=int, default=1000)
     parser.add_argument("--runs", type=int, default=2)
     parser.add_argument("--seed", type=int, default=1)
     asked = parser.parse_args()

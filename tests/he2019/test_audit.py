@@ -148,7 +148,7 @@ def test_every_finding_is_shown_the_gravest_first(audit, section):
     text = reader.text
     assert reader.open == []
     assert {f"audit-{f.key}" for f in audit.findings} <= set(reader.ids)
-    assert re.findall(r'<h3 id="audit-(\w+)">', section) == [
+    assert re.findall(r'<span id="audit-(\w+)">', section) == [
         "contradicted", "corrected", "confirmed", "consistent", "untestable", "figures",
     ]  # fmt: skip
     for verdict in audit.counts:

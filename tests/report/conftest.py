@@ -23,6 +23,7 @@ def records(results: dict[str, Any]) -> Records:
     inputs = {
         key: {
             "data": {"file": f"data/{key}.csv", "sha256": f"{i:02x}da7a" * 8, "ignored": [],
+                     "source": r.task.table.source,
                      "source_sha256": "ab" * 32},
             "priors": {"file": f"priors/{key}.toml", "sha256": f"{i:02x}b0b1" * 8,
                        "source": f"{r.task.model}.toml"},

@@ -38,7 +38,6 @@ from calib.report.numbers import TIMES
 from calib.report.reference import NOTHING, Reference
 from calib.report.study import OutputResult
 from calib.validation.constants import FAR_SDS
-from calib.validation.scores import MOVED, PRIOR, ROLES, role
 
 
 def corner_plate(result: OutputResult, reference: Reference = NOTHING) -> Plate:
@@ -123,7 +122,7 @@ def learned_plate(result: OutputResult, reference: Reference = NOTHING) -> Plate
     calibration = result.calibration
     free = calibration.problem.priors.free
     marks = reference.sampled(calibration.problem.bound)
-    roles = {p.name: role(calibration, p.name) for p in free}
+    known = {p.name: result.sensitivity[p.name] for p in free}
     ratios = {p.name: calibration.summary[p.name].sd_ratio for p in free}
     cols = min(4, len(free)) if len(free) != 5 else 3
     rows = -(-len(free) // cols)
@@ -133,17 +132,16 @@ def learned_plate(result: OutputResult, reference: Reference = NOTHING) -> Plate
     handles: dict[str, Any] = {}
     for j, (ax, prior) in enumerate(zip(axes.flat, free, strict=False)):
         handles |= _prior_posterior(ax, prior, t[:, j], marks.get(prior.name))
-        what = roles[prior.name]
-        colour, weight = (style.EMBER, "bold") if what in (PRIOR, MOVED) else (BLACK, "normal")
-        title = f"{what}, sd ratio {short(ratios[prior.name])}"
+        found = known[prior.name]
+        colour, weight = (BLACK, "normal") if found.identified else (style.EMBER, "bold")
+        title = f"{found.reading}, sd ratio {short(ratios[prior.name])}"
         ax.set_title(title, fontsize=SMALLEST_PT, color=colour, weight=weight)
     style.hide_rest(axes, len(free))
     style.legend_below(fig, handles, 3)
-    named = {what: [plain(n) for n in roles if roles[n] == what] for what in ROLES}
     sharpest = min(ratios, key=lambda name: ratios[name])
     said = caption(
         "learned",
-        roles={what: names for what, names in named.items() if names},
+        unknown=[plain(name) for name, found in known.items() if not found.identified],
         sharpest=sharpest,
         ratio=ratios[sharpest],
     )

@@ -32,7 +32,6 @@ from calib.report.numbers import (
 )
 from calib.report.page.template import words
 from calib.report.reference import Figure
-from calib.validation.scores import MOVED, PRIOR
 
 TICK = "\N{CHECK MARK}"
 _LEVELS = ("50", "90", "95")
@@ -122,21 +121,42 @@ def _number(value: float | None, digits: int = 3, form: str = "") -> str:
 
 
 def posterior_table(o: Output) -> Table:
-    """Return the posterior summary of an output: parameters that follow from others first.
-
-    A page says what set each parameter, too.
-    """
-    derived = [s for s in o.posterior if s.sd_ratio != s.sd_ratio]
-    sampled = [s for s in o.posterior if s.sd_ratio == s.sd_ratio]
-    roles = o.facts.get("roles", {})
-    groups = [[_posterior_row(s, roles) for s in group] for group in (derived, sampled)]
+    """Return the posterior summary: sampled parameters, then what follows from them."""
+    sampled, derived = _sampled_and_derived(o)
+    groups = [[_posterior_row(s) for s in group] for group in (sampled, derived)]
     said = _caption("posterior", o=o, derived=derived)
     return Table(f"posterior_{o.key}", said, "lrrrrrr", groups)
 
 
-def _posterior_row(s: ParameterSummary, roles: Mapping[str, str]) -> Row:
-    role = roles.get(s.name, "") or "follows from the others"
-    set_by = f"[!{role}]" if role in (PRIOR, MOVED) else role
+def _sampled_and_derived(o: Output) -> tuple[list[ParameterSummary], list[ParameterSummary]]:
+    """Return the parameters that were sampled, and those that follow and are not the same again."""
+    sampled = [s for s in o.posterior if s.sd_ratio == s.sd_ratio]
+    known = {(s.mean, s.sd) for s in sampled}
+    follow = [s for s in o.posterior if s.sd_ratio != s.sd_ratio and (s.mean, s.sd) not in known]
+    return sampled, follow
+
+
+def parameters_table(o: Output) -> Table:
+    """Return what a page says first of the parameters: meaning, posterior, what identifies each."""
+    known = o.found["prior_sensitivity"]["parameters"]
+    meanings = {"sigma": "standard deviation of the noise", **o.model.meanings}
+
+    def row(s: ParameterSummary) -> Row:
+        said = known[s.name]["reading"] if s.name in known else NOTHING
+        sure = s.name not in known or known[s.name]["identified"]
+        return {
+            "Parameter": _named(s.name, s.unit),
+            "Meaning": meanings.get(s.name, NOTHING),
+            "Posterior": centre_text(s),
+            "95 % HDI": interval_text(s),
+            "Identified by": said if sure else f"[!{said}]",
+        }
+
+    groups = [[row(s) for s in group] for group in _sampled_and_derived(o)]
+    return Table(f"parameters_{o.key}", "", "llrrl", groups)
+
+
+def _posterior_row(s: ParameterSummary) -> Row:
     return {
         "Parameter": _named(s.name, s.unit),
         "Posterior": centre_text(s),
@@ -145,7 +165,6 @@ def _posterior_row(s: ParameterSummary, roles: Mapping[str, str]) -> Row:
         "ESS tail": f"{s.ess_tail:.0f}",
         "R-hat": f"{s.rhat:.3f}",
         "sd/prior sd": format_number(s.sd_ratio, 2),
-        **({"Set by": set_by} if roles else {}),
     }
 
 
