@@ -58,8 +58,8 @@ lint: $(READY)
 	$(BIN)/ruff format --check calib challenge tests benchmarks docs
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/proselint check --config docs/proselint.json README.md CONTRIBUTING.md docs/*.md \
-	  docs/formats docs/reading docs/statistics docs/tutorials
+	$(BIN)/proselint check --config docs/proselint.json README.md CONTRIBUTING.md CODE_OF_CONDUCT.md SECURITY.md \
+	  docs/*.md docs/formats docs/joss docs/reading docs/statistics docs/tutorials
 
 format: $(READY)
 	$(BIN)/ruff check --fix calib challenge tests benchmarks docs
