@@ -8,12 +8,14 @@ it or to predict at it; elsewhere there is a warning. The user can say that the 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from numbers import Real
 from pathlib import PurePath
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.arguments import takes
 from calib.data.files import plain_number
 from calib.data.quantities import QUANTITIES, Quantity, columns_of, convert
 from calib.data.reader import Tabular, as_table
@@ -368,6 +370,7 @@ def check_varies(table: Table, column: str) -> None:
     )  # fmt: skip
 
 
+@takes(quantity_header=str, value=Real)
 def hold_out(
     table: Tabular, quantity_header: str, value: float, rel_tol: float = 1e-3
 ) -> tuple[Table, Table]:

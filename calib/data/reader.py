@@ -16,11 +16,13 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from os import PathLike
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calib.arguments import takes
 from calib.data.files import CsvFile, number_in, open_csv, with_points
 from calib.data.quantities import OUTPUTS, QUANTITIES
 from calib.data.registry import Registry
@@ -348,6 +350,7 @@ def _checked(
     return values, problems
 
 
+@takes(path=PathLike)
 def read_table(
     path: str | os.PathLike[str],
     *,

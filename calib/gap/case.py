@@ -27,12 +27,14 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
+from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from calib.arguments import takes
 from calib.data import Table, read_table
 from calib.data.files import TOML_HINT, read_text, read_toml
 from calib.data.quantities import OUTPUTS, output_of
@@ -164,6 +166,7 @@ class Case:
         return common_label(self.lab, self.field)
 
 
+@takes(folder=PathLike)
 def read_case(folder: Path) -> Case:
     """Read a case folder.
 

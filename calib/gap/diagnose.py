@@ -6,11 +6,14 @@ from collections import Counter
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, fields, replace
+from numbers import Integral
+from os import PathLike
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.arguments import takes
 from calib.batch.environment import one_thread
 from calib.batch.pool import HERE
 from calib.data.quantities import OUTPUTS, columns_of, role_of
@@ -112,6 +115,7 @@ class Diagnosis(Shown):
         return f"<Diagnosis of {self.data.case.name}: {self.verdict}; {best}>"
 
 
+@takes(case=(Case, PathLike), seed=Integral, effects=Mapping)
 def diagnose(
     case: Case | str | Path,
     seed: int = 1,

@@ -68,6 +68,14 @@ def predict(
             )
         return prediction.predict(found, table)
     from calib.gap.corrected import predict_corrected  # late: a calibration does without
+    from calib.gap.diagnose import Diagnosis
 
+    if not isinstance(found, Diagnosis):
+        raise CalibError(
+            f"{type(found).__name__} predicts nothing",
+            where="calib.predict",
+            expected="what calib.calibrate or calib.diagnose returns",
+            hint="calibrate the problem first: calib.calibrate(problem, seed=1)",
+        )
     left_out = [without] if isinstance(without, str) else without
     return predict_corrected(found.corrected, table, left_out)

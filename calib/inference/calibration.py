@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from numbers import Integral
 
 import numpy as np
 
+from calib.arguments import takes
 from calib.inference.diagnostics import convergence, ess, hdi, hdi_error, median_error
 from calib.inference.estimators import PointEstimate
 from calib.inference.problem import Problem
@@ -158,6 +160,7 @@ def moments(draws: Array) -> dict[str, float]:
     }
 
 
+@takes(problem=Problem, seed=Integral, settings=SamplerSettings)
 def calibrate(
     problem: Problem,
     seed: int,

@@ -14,6 +14,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
+from os import PathLike
 from pathlib import Path, PurePath, PurePosixPath
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, get_args
 
@@ -29,6 +30,7 @@ from pydantic import (
     ValidationError,
 )
 
+from calib.arguments import takes
 from calib.batch.environment import Environment, differs_in_lines, sha256
 from calib.data import read_for_model, write_table
 from calib.errors import CalibError, in_words
@@ -190,6 +192,7 @@ _OF_DRAWS = ("log_evidence", "efficiency", "acceptance", "evaluations")
 _OF_GATE = ("rhat", "ess_bulk", "ess_tail", "tau")
 
 
+@takes(calibration=Calibration)
 def to_datatree(calibration: Calibration) -> xr.DataTree:
     """Return a calibration as an ArviZ DataTree.
 
@@ -355,6 +358,7 @@ def describe_estimates(estimates: Sequence[PointEstimate]) -> list[dict[str, Any
     ]
 
 
+@takes(calibration=Calibration, folder=PathLike)
 def save_calibration(
     calibration: Calibration,
     folder: str | Path,
@@ -394,6 +398,7 @@ def save_calibration(
     (folder / RUN).write_text(json.dumps(described, indent=1) + "\n", encoding="utf-8")
 
 
+@takes(folder=PathLike)
 def load_calibration(folder: Path) -> Calibration:
     """Read a run folder.
 

@@ -19,9 +19,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from os import PathLike
+from pathlib import Path
 
 import numpy as np
 
+from calib.arguments import takes
 from calib.data import Table, as_table, check_enough, check_settings, check_varies
 from calib.data.checks import check_units
 from calib.data.files import plain_number
@@ -41,6 +44,7 @@ from calib.inference.likelihood import (
     serial_of,
 )
 from calib.inference.prior_files import (
+    DeclaredPriors,
     PriorFile,
     default_priors,
     read_priors,
@@ -328,10 +332,11 @@ class Problem:
         return replace(self, priors=self.priors.fix(values))
 
 
+@takes(model_name=str, prior_path=(PathLike, DeclaredPriors), fixed=Mapping)
 def build_problem(
     model_name: str,
     table: Tabular,
-    prior_path: PriorFile | None = None,
+    prior_path: PriorFile | str | None = None,
     *,
     fixed: Mapping[str, float] | None = None,
 ) -> Problem:
@@ -343,7 +348,7 @@ def build_problem(
         One of `calib.models.MODELS`.
     table : Table, mapping of str to array_like, or pandas.DataFrame
         Calibration data with the model's conditions and its output.
-    prior_path : Path or PriorFile, optional
+    prior_path : path or PriorFile, optional
         The model's own, or the shipped one, by default.
     fixed : mapping of str to float, optional
         Natural parameters to hold at a value.
@@ -366,8 +371,9 @@ def build_problem(
     model, table = get_model(model_name), as_table(table)
     table.must_have(*model.conditions, model.output)
     references = prior_references(table.columns)
+    own = Path(prior_path) if isinstance(prior_path, str) else prior_path
     priors = read_priors(
-        prior_path or default_priors(model.name),
+        own or default_priors(model.name),
         model.name,
         (*model.parameters, "sigma"),
         references,

@@ -12,6 +12,7 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -65,6 +66,17 @@ class SamplerSettings:
     max_steps: int = 25_600
     keep: int = JUDGED
     gate: Gate = field(default_factory=Gate)
+
+    def __post_init__(self) -> None:
+        for name in ("ensembles", "steps", "max_steps", "keep"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, Integral) or int(value) < 1:
+                raise CalibError(
+                    f"{name} = {value!r}",
+                    where="calib.SamplerSettings",
+                    expected="a whole number from 1 on",
+                    hint=f"correct {name}, or leave it out",
+                )
 
     def n_walkers(self, n_dim: int) -> int:
         """Number of walkers for a dimension; a CalibError if emcee cannot move so few."""

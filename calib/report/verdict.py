@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from calib.arguments import takes
 from calib.data.quantities import output_of, role_of
 from calib.inference.calibration import Calibration
 from calib.inference.io import RUN
@@ -258,6 +259,7 @@ def _elsewhere(column: str, values: Sequence[float]) -> tuple[Range, ...]:
     return tuple(Range(column, low * (1.0 + 1e-9), high * (1.0 - 1e-9)) for low, high in pairs)
 
 
+@takes(calibration=Calibration, validation=Validation, loo=Validation)
 def verdict(
     calibration: Calibration,
     validation: Validation | None = None,

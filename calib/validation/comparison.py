@@ -12,12 +12,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from numbers import Integral
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from scipy.special import logsumexp
 
+from calib.arguments import takes
 from calib.batch.folders import keep
 from calib.data import Table, as_table
 from calib.data.reader import Tabular
@@ -153,6 +155,7 @@ def difference(rows: Array) -> Difference:
     return Difference(float(rows.sum()), float(np.sqrt(rows.size * rows.var(ddof=1))))
 
 
+@takes(seed=Integral, settings=SamplerSettings)
 def compare(
     models: Sequence[str],
     table: Tabular,

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import logsumexp
 
+from calib.arguments import takes
 from calib.batch.environment import one_thread
 from calib.batch.tasks import completed
 from calib.data import Table, as_table
@@ -75,6 +76,7 @@ class Validation(Shown):
         )
 
 
+@takes(calibration=Calibration)
 @one_thread()
 def validate_held_out(calibration: Calibration, held_out: Tabular) -> Validation:
     """Score the calibration on rows it has not seen.
@@ -120,6 +122,7 @@ def validate_held_out(calibration: Calibration, held_out: Tabular) -> Validation
     return Validation("held_out", held_out, observed, draws, scores)
 
 
+@takes(calibration=Calibration, settings=SamplerSettings)
 @one_thread()
 def leave_one_out(
     calibration: Calibration,

@@ -1,10 +1,10 @@
 """A slow reference for the diagnosis: `python -m tests.gap.reference CASE [--particles N]`.
 
 Each explanation in play is drawn again, over all its coordinates, by likelihood-tempered sequential
-Monte Carlo (Del Moral, Doucet & Jasra 2006, doi:10.1111/j.1467-9868.2006.00553.x): particles of the
-prior are reweighted with the likelihood to a small power more, resampled, and moved by random walks
-with their own covariance. Nothing is linearised, integrated out or guessed. An evidence has an
-error of some 0.15 nats with 1000 particles.
+Monte Carlo (Del Moral, Doucet & Jasra 2006, doi:10.1111/j.1467-9868.2006.00553.x). Particles of the
+prior are reweighted with the likelihood to a small power more, resampled, and moved by random
+walks, each half by the covariance of the other. Nothing is linearised or integrated out. An
+evidence has an error of some 0.15 nats with 1000 particles.
 """
 
 from __future__ import annotations

@@ -185,7 +185,7 @@ def test_tables_say_what_set_each_parameter(drawbar, rut):
     assert first["D_lo"]["Identified by"] == "data"
     assert first["D_lo"]["Meaning"] == "largest pull at the lowest pressure"
     # Published parameters follow from those that were sampled; b0 is C under another name.
-    assert list(first)[0] == "K_lo"
+    assert next(iter(first)) == "K_lo"
     assert list(first)[-1] == "c9"
     assert "b0" not in first
     named = tables["sensitivity"].caption.partition(".")[0]

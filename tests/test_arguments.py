@@ -1,0 +1,69 @@
+"""Arguments of the wrong kind are refused where people call, with what is expected."""
+
+from __future__ import annotations
+
+import pandas as pd
+import pytest
+
+import calib
+
+RUTS = calib.load_he2019("rut_depth")
+PROBLEM = calib.build_problem("bekker", RUTS)
+
+
+@pytest.mark.parametrize(
+    ("call", "said", "expected"),
+    [
+        (lambda: calib.calibrate(PROBLEM, seed=-1), "seed = -1", "a whole number from 0 on"),
+        (lambda: calib.calibrate(PROBLEM, seed=1.5), "seed = 1.5", "a whole number from 0 on"),
+        (lambda: calib.calibrate(PROBLEM, seed=True), "seed = True", "a whole number from 0 on"),
+        (lambda: calib.calibrate(RUTS, seed=1), "problem is of the type Table", "calib.Problem"),
+        (
+            lambda: calib.calibrate(PROBLEM, seed=1, settings={"steps": 3}),
+            "settings is of the type dict", "calib.SamplerSettings",
+        ),
+        (
+            lambda: calib.build_problem("bekker", RUTS, fixed=["n"]),
+            "fixed is of the type list", "a dictionary",
+        ),
+        (lambda: calib.build_problem(None, RUTS), "model_name is of the type NoneType", "text"),
+        (lambda: calib.SamplerSettings(steps=-1), "steps = -1", "a whole number from 1 on"),
+        (lambda: calib.SamplerSettings(max_steps=1.5), "max_steps = 1.5", "a whole number"),
+        (
+            lambda: calib.diagnose(pd.DataFrame({"a": [1.0]})),
+            "case is of the type DataFrame", "calib.Case or a path",
+        ),
+        (
+            lambda: calib.hold_out(RUTS, "inflation_pressure_psi", [30.0]),
+            "value is of the type list", "a number",
+        ),
+        (lambda: calib.predict(PROBLEM, RUTS), "Problem predicts nothing", "calib.calibrate"),
+        (
+            lambda: calib.leave_one_out(PROBLEM),
+            "calibration is of the type Problem", "calib.Calibration",
+        ),
+        (lambda: calib.read_case(None), "folder is of the type NoneType", "a path"),
+        (lambda: calib.read_table(3), "path = 3", "a path"),
+        (
+            lambda: calib.verdict(PROBLEM),
+            "calibration is of the type Problem", "calib.Calibration",
+        ),
+    ],
+)  # fmt: skip
+def test_it_is_refused(call, said, expected):
+    with pytest.raises(calib.CalibError) as refused:
+        call()
+    assert said in refused.value.message
+    assert expected in refused.value.expected
+    assert refused.value.hint
+
+
+def test_the_path_of_a_prior_file_may_be_text(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(PROBLEM.priors.text)
+    assert calib.build_problem("bekker", RUTS, str(path)).priors.names == PROBLEM.priors.names
+
+
+def test_too_many_arguments_are_for_python_to_refuse():
+    with pytest.raises(TypeError, match="levels"):
+        calib.predict(PROBLEM, RUTS, levels=[0.9])
