@@ -59,7 +59,7 @@ lint: $(READY)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/proselint check --config docs/proselint.json README.md CONTRIBUTING.md CODE_OF_CONDUCT.md SECURITY.md \
-	  docs/*.md docs/formats docs/joss docs/reading docs/statistics docs/tutorials
+	  docs/*.md docs/formats docs/joss docs/gallery docs/reading docs/statistics docs/tutorials
 
 format: $(READY)
 	$(BIN)/ruff check --fix calib challenge tests benchmarks docs

@@ -19,7 +19,7 @@ except metadata.PackageNotFoundError:  # a checkout that is not installed
     release = ""
 
 extensions = [
-    "myst_parser", "mathml", "declared", "sphinx.ext.autodoc", "sphinx.ext.napoleon",
+    "myst_nb", "kernels", "mathml", "declared", "sphinx.ext.autodoc", "sphinx.ext.napoleon",
 ]  # fmt: skip
 autodoc_typehints = "none"
 autodoc_preserve_defaults = True
@@ -28,11 +28,17 @@ napoleon_use_rtype = False
 exclude_patterns = ["_ext", "joss"]  # a paper, built by its journal
 myst_enable_extensions = ["dollarmath", "colon_fence", "deflist", "attrs_block"]
 myst_heading_anchors = 3
+# Notebooks, and no other pages, are run at every build: their outputs are those of this code.
+nb_execution_mode = "force"
+nb_execution_in_temp = True
+nb_execution_raise_on_error = True
+nb_execution_timeout = 300  # seconds, for each cell
+nb_output_stderr = "warn"
 html_math_renderer = "mathml"
 html_theme = "furo"
 html_title = "calib"
 html_static_path = ["_static", "../calib/report/page/page.js"]
-html_css_files = ["tables.css"]
+html_css_files = ["tables.css", "notebooks.css"]
 html_js_files = [("page.js", {"defer": ""})]  # tables sort as those of a report do
 html_copy_source = False
 html_show_sourcelink = False

@@ -20,7 +20,8 @@ from calib.models import MODELS
 from tests.browser import Browser, faults
 from tests.docs.pages import DOCS, ROOT
 
-ABSENT = [name for name in ("sphinx", "myst_parser", "furo") if find_spec(name) is None]
+NEEDED = ("sphinx", "myst_nb", "ipykernel", "furo")
+ABSENT = [name for name in NEEDED if find_spec(name) is None]
 pytestmark = pytest.mark.skipif(
     bool(ABSENT), reason=f"{', '.join(ABSENT)} not installed: pip install -e '.[docs]'"
 )

@@ -44,7 +44,9 @@ def shown():
 def test_every_result_has_a_short_name_a_table_a_figure_and_a_view(i):
     found = shown()[i]
     assert len(repr(found)) < 300
-    assert isinstance(found.plot(), Figure)
+    drawn = found.plot()
+    assert isinstance(drawn, Figure)
+    assert drawn._repr_png_().startswith(b"\x89PNG")  # in a notebook without pyplot
     frame = found.to_dataframe()
     assert len(frame) >= 2
     assert "<table" in found._repr_html_()

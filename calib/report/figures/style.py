@@ -52,6 +52,13 @@ def _settings() -> Mapping[Any, Any]:
     return {name: value for name, value in found.items() if name != "backend"}
 
 
+class Drawn(Figure):
+    """A figure that a notebook shows, even where nothing has imported pyplot."""
+
+    def _repr_png_(self) -> bytes:
+        return png_bytes(self)
+
+
 @contextmanager
 def style() -> Iterator[None]:
     """Draw in the project's style, whatever the user's own settings are."""
@@ -79,7 +86,7 @@ def panels(
     them. What else is given is for `Figure.subplots`.
     """
     total = top + bottom + rows * height + (rows - 1) * gap_y
-    figure = Figure(figsize=(width * _MM, total * _MM))
+    figure = Drawn(figsize=(width * _MM, total * _MM))
     axes = figure.subplots(rows, cols, squeeze=False, **how)
     figure.subplots_adjust(
         left=left / width,
