@@ -125,5 +125,27 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module 'calib' has no attribute {name!r}")
 
 
+# What verbs return, and what few people type: there, but not among the names that are listed.
+_UNLISTED = [
+    "Audit",
+    "Calibration",
+    "Case",
+    "Comparison",
+    "Diagnosis",
+    "Emulation",
+    "PointEstimate",
+    "Prediction",
+    "Problem",
+    "Table",
+    "Validation",
+    "Verdict",
+    "estimate",
+    "read_plan",
+    "run_audit",
+    "run_campaign",
+    "table_from_arrays",
+]
+
+
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return sorted(set(__all__) - set(_UNLISTED))

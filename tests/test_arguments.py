@@ -67,3 +67,8 @@ def test_the_path_of_a_prior_file_may_be_text(tmp_path):
 def test_too_many_arguments_are_for_python_to_refuse():
     with pytest.raises(TypeError, match="levels"):
         calib.predict(PROBLEM, RUTS, levels=[0.9])
+
+
+def test_few_names_are_listed_and_all_are_there():
+    assert len(dir(calib)) < 30
+    assert all(hasattr(calib, name) for name in calib.__all__)

@@ -33,6 +33,7 @@ from pydantic import (
 from calib.arguments import takes
 from calib.batch.environment import Environment, differs_in_lines, sha256
 from calib.data import read_for_model, write_table
+from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError, in_words
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.diagnostics import GateReport
@@ -196,9 +197,9 @@ _OF_GATE = ("rhat", "ess_bulk", "ess_tail", "tau")
 def to_datatree(calibration: Calibration) -> xr.DataTree:
     """Return a calibration as an ArviZ DataTree.
 
-    Chains are walkers (`sample_stats.ensemble` says of which ensemble), so that effective sample
-    sizes computed from the file are those of the gate. Groups: posterior, prior, log_prior,
-    posterior_predictive, log_likelihood, sample_stats, observed_data, constant_data.
+    Chains are the independently seeded ensembles, with the draws of one walker after another's
+    (`sample_stats.walker`). Variables have `units` and `long_name`. Groups: posterior, prior,
+    log_prior, posterior_predictive, log_likelihood, sample_stats, observed_data, constant_data.
 
     Examples
     --------
@@ -206,8 +207,8 @@ def to_datatree(calibration: Calibration) -> xr.DataTree:
     >>> ruts = calib.load_he2019("rut_depth")
     >>> calibration = calib.calibrate(calib.build_problem("bekker", ruts), seed=1)
     >>> tree = calib.to_datatree(calibration)
-    >>> sorted(tree.children)[:3]
-    ['constant_data', 'log_likelihood', 'log_prior']
+    >>> tree["posterior"].sizes["chain"], tree["posterior"]["z_ref"].attrs["units"]
+    (4, 'mm')
     """
     import xarray as xr  # late: half a second
 
@@ -217,7 +218,8 @@ def to_datatree(calibration: Calibration) -> xr.DataTree:
     # Groups with a number for every draw and row have 64 MB at most: of long data fewer draws.
     kept = min(steps, 8_000_000 // (chains * problem.response.size))
     picked = np.linspace(0, steps - 1, kept).round().astype(int)
-    shape = (chains, kept, problem.response.size)
+    ensembles, walkers = draws.t.shape[:2]
+    shape = (ensembles, walkers * kept, problem.response.size)
     by_row: dict[str, Mapping[str, NDArray[Any]]] = {}
     if kept:
         natural = calibration.natural[:, picked].reshape(-1, calibration.natural.shape[-1])
@@ -231,29 +233,42 @@ def to_datatree(calibration: Calibration) -> xr.DataTree:
             "posterior_predictive": {output: measured},
             "log_likelihood": {output: problem.log_likelihood_left_out(internal).reshape(shape)},
         }
-    ensembles = np.repeat(np.arange(draws.t.shape[0]), draws.t.shape[1])
+    whole = (ensembles, walkers * steps)
     groups = {
-        "posterior": calibration.parameters,
+        "posterior": {n: v.reshape(whole) for n, v in calibration.parameters.items()},
         "prior": _prior_group(calibration),
         **by_row,
-        "log_prior": {"joint": problem.priors.log_prob(draws.flat).reshape(chains, steps)},
+        "log_prior": {"joint": problem.priors.log_prob(draws.flat).reshape(whole)},
         "sample_stats": {
-            "lp": draws.log_prob.reshape(chains, steps),
-            "ensemble": np.repeat(ensembles[:, None], steps, axis=1),
+            "lp": draws.log_prob.reshape(whole),
+            "walker": np.tile(np.repeat(np.arange(walkers), steps), (ensembles, 1)),
         },
         "observed_data": {output: problem.observed},
         "constant_data": problem.conditions,
     }
+    said = _units_and_meanings(problem)
     datasets = {}
     for group, variables in groups.items():
         dims = ("row",) if group in ("observed_data", "constant_data") else (*DRAWN, "row")
-        named = {name: (dims[: values.ndim], values) for name, values in variables.items()}
+        about = {} if group in ("log_likelihood", "sample_stats") else said
+        named = {n: (dims[: v.ndim], v, about.get(n, {})) for n, v in variables.items()}
         data = xr.Dataset(named)
         datasets[group] = data.assign_coords({d: np.arange(n) for d, n in data.sizes.items()})
     tree = xr.DataTree.from_dict(datasets)
     # Without durations: equal results give equal files.
     tree.attrs["run"] = json.dumps(_describe(calibration))
     return tree
+
+
+def _units_and_meanings(problem: Problem) -> dict[str, dict[str, str]]:
+    """Return the attributes of variables: parameters and columns."""
+    model = problem.bound.model
+    units = dict(model.reported) | {p.name: p.unit for p in problem.priors.entries}
+    meanings = {"sigma": "standard deviation of the noise", **model.meanings}
+    columns = [QUANTITIES[c] for c in (*problem.conditions, model.output)]
+    return {n: {"units": u, "long_name": meanings.get(n, n)} for n, u in units.items()} | {
+        q.canonical: {"units": q.unit, "long_name": q.description} for q in columns
+    }
 
 
 def save_posterior(calibration: Calibration, path: Path) -> None:
@@ -285,8 +300,12 @@ def read_netcdf(path: Path) -> xr.DataTree:
         return tree.load()
 
 
+def _of_walkers(values: xr.DataArray, steps: int) -> NDArray[np.float64]:
+    return np.asarray(values.to_numpy(), dtype=np.float64).reshape(-1, steps)
+
+
 class DrawsFile(NamedTuple):
-    """The draws in a file (chains, draws) by parameter, and their log density."""
+    """The draws in a file (walkers, steps) by parameter, and their log density."""
 
     draws: Mapping[str, NDArray[np.float64]]
     log_prob: NDArray[np.float64]
@@ -295,8 +314,10 @@ class DrawsFile(NamedTuple):
 def read_draws(path: Path) -> DrawsFile:
     """Read the posterior draws in a file; raises what `read_netcdf` does, if there are none too."""
     tree = read_netcdf(path)
-    draws = {str(name): v.to_numpy() for name, v in tree["posterior"].data_vars.items()}
-    log_prob = tree["sample_stats"]["lp"].to_numpy()
+    # By walker, as effective sample sizes are worked out.
+    steps = json.loads(tree.attrs["run"])["shape"][2]
+    draws = {str(n): _of_walkers(v, steps) for n, v in tree["posterior"].data_vars.items()}
+    log_prob = _of_walkers(tree["sample_stats"].data_vars["lp"], steps)
     if log_prob.ndim != 2 or not log_prob.size or not draws:
         raise ValueError("there are no draws in it")
     if any(v.shape != log_prob.shape for v in draws.values()):
