@@ -26,7 +26,7 @@ from calib.inference.sampler import SamplerSettings
 from calib.models import MODELS, get_model
 from calib.models.simulators.emulator import emulator_of, save_emulator
 from calib.report.document import Output, outputs, page_facts, summarise
-from calib.report.figures.collect import Drawn, draw
+from calib.report.figures.collect import NARROW, Drawn, draw
 from calib.report.labels import joined, plain
 from calib.report.markup import prose, to_html
 from calib.report.numbers import TIMES
@@ -270,7 +270,12 @@ def _section(o: Output, result: OutputResult, drawn: Drawn | None) -> dict[str, 
         "methods": joined([method_name(m) for m in o.found["estimates"]]) or "none",
         "figures": {
             p.name: {
-                **picture(p, drawn.files.get(f"{o.key}_{p.name}.png", b""), said(p.caption)),
+                **picture(
+                    p,
+                    drawn.files.get(f"{o.key}_{p.name}.png", b""),
+                    said(p.caption),
+                    drawn.files.get(f"{o.key}_{p.name}{NARROW}.png", b""),
+                ),
                 "alt": p.caption,
             }
             for p in drawn.plates

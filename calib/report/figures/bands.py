@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import matplotlib as mpl
@@ -136,8 +136,20 @@ def _panel(ax: Axes, result: _Result, group: Group, reference: Reference) -> dic
                 scale(table[x][away]), low, high, color=GREY, lw=3.0, alpha=0.5, zorder=3.5
             )
         at, values = scale(table[x][rows]), y_axis.scale(table[y][rows])
-        handles[f"{word}, {name}"] = _points(ax, at, values, held=is_held)
+        dots = handles[f"{word}, {name}"] = _points(ax, at, values, held=is_held)
+        if draws is not None:
+            expected = y_axis.scale(np.nanquantile(draws[:, rows], [0.05, 0.5, 0.95], axis=0))
+            style.say_of_points(dots, _said(axis_of(x), y_axis, at, values, expected, name))
     return handles
+
+
+def _said(x: Axis, y: Axis, at: Array, values: Array, expected: Array, name: str) -> Iterator[str]:
+    """Say of measured points where they are, and what was expected there (3, n)."""
+    for place, value, (low, middle, high) in zip(at, values, expected.T, strict=True):
+        yield (
+            f"{x.name} {short(place, 3)} {x.unit}, {name}: measured {short(value, 3)} {y.unit}; "
+            f"expected {short(middle, 3)} ({short(low, 3)} to {short(high, 3)}, 90 % band)"
+        )
 
 
 def _elsewhere(table: Table, drawn: Mapping[str, Array], x: str) -> NDArray[np.bool_]:
@@ -277,6 +289,11 @@ def _against_cone_index(
     of_cone, of_density = axis_of(cone), axis_of(problem.bound.model.output)
     look: Any = {"cmap": _WATER, "s": 17, "edgecolor": BLACK, "linewidth": 0.4, "zorder": 4}
     points = ax.scatter(of_cone.scale(ci), of_density.scale(problem.observed), c=w, **look)
+    if result.validation is not None and result.validation.draws.shape[1] == ci.size:
+        expected = np.nanquantile(result.validation.draws, [0.05, 0.5, 0.95], axis=0)
+        values = of_density.scale(problem.observed), of_density.scale(expected)
+        said = _said(of_cone, of_density, of_cone.scale(ci), *values, "left out")
+        style.say_of_points(points, said)
     x = np.linspace(ci.min(), ci.max(), 60)
     handles: dict[str, Any] = {}
     for quantile, dashes in zip((0.1, 0.5, 0.9), DASHES, strict=False):

@@ -33,6 +33,9 @@ def plates(result: OutputResult, reference: Reference = NOTHING) -> list[Plate]:
     return style.draw_all({n: partial(draw, result, reference) for n, draw in drawings.items()})
 
 
+NARROW = "_narrow"  # of the first figure, its panels below each other
+
+
 @dataclass(frozen=True)
 class Drawn:
     """Figures of an output: PNG, and PDF where it was asked for, by file name."""
@@ -52,4 +55,9 @@ def draw(key: str, result: OutputResult, *, pdf: bool = False) -> Drawn:
             files[f"{key}_{plate.name}.png"] = style.png(plate)
             if pdf:
                 files[f"{key}_{plate.name}.pdf"] = style.pdf_bytes(plate.figure)
-    return Drawn(tuple(replace(plate, figure=None) for plate in drawn), files)
+    points = {p.name: style.said_of_points(p.figure) for p in drawn if p.figure is not None}
+    for first in drawn[:1]:
+        if first.figure is not None and style.stack(first.figure):
+            files[f"{key}_{first.name}{NARROW}.png"] = style.png(first)
+    kept = (replace(p, figure=None, points=points.get(p.name, ())) for p in drawn)
+    return Drawn(tuple(kept), files)

@@ -68,6 +68,13 @@ def corrected_plate(d: GapDocument, say: Words) -> Plate | None:
         (new,) = ax.plot(at, after, color=BLUE, lw=1.6)
         where = x.scale(np.array(curve.readings_at)), y.scale(np.array(curve.readings))
         (dots,) = ax.plot(*where, "o", ms=3.6, color=BLACK, zorder=4, **DOTS)
+        style.say_of_points(
+            dots,
+            (
+                f"{x.name} {short(place, 3)} {x.unit}: measured {short(value, 3)} {y.unit}"
+                for place, value in zip(*where, strict=True)
+            ),
+        )
         ax.set(xlabel=x.label, ylabel=y.label)
         handles = {
             "field readings": dots,

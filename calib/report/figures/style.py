@@ -17,6 +17,7 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
@@ -43,6 +44,7 @@ SINGLE_MM, MIDDLE_MM, DOUBLE_MM = 90.0, 140.0, 190.0
 # As in print.mplstyle: no text is smaller; subscripts, of 0.7 the size, are 6 pt.
 SMALLEST_PT, SYMBOL_PT = 7.0, 8.6
 _MM = 1.0 / 25.4
+_SAID = "said:"
 
 
 @cache
@@ -127,6 +129,57 @@ def legend_below(figure: Figure, handles: Mapping[str, Any], ncols: int) -> None
     )  # fmt: skip
 
 
+def stack(figure: Figure) -> bool:
+    """Put the panels of a figure's only row below each other, for a narrow screen.
+
+    False, and nothing is changed, where there is one panel, or more rows than one.
+    """
+    axes = [ax for ax in figure.axes if ax.get_visible()]
+    if len(axes) < 2 or len({round(ax.get_position().y0, 3) for ax in axes}) > 1:
+        return False
+    height = figure.get_figheight() / _MM
+    panel = axes[0].get_position().height * height
+    for legend in list(figure.legends):
+        handles, texts = legend.legend_handles, [t.get_text() for t in legend.get_texts()]
+        legend.remove()
+        with style():
+            legend_below(figure, dict(zip(texts, handles, strict=True)), 1)
+    below = 14.0 + sum(4.2 * len(legend.get_texts()) for legend in figure.legends)
+    left, gap = 16.0, 16.0
+    total = below + len(axes) * (panel + gap)
+    figure.set_size_inches(SINGLE_MM * _MM, total * _MM)
+    for i, ax in enumerate(axes):
+        right = 24.0 if ax.child_axes else 3.0
+        bottom = below + (len(axes) - 1 - i) * (panel + gap)
+        width = SINGLE_MM - left - right
+        ax.set_position((left / SINGLE_MM, bottom / total, width / SINGLE_MM, panel / total))
+        ax.tick_params(labelbottom=True, labelleft=True)
+        ax.set_ylabel(ax.get_ylabel() or axes[0].get_ylabel())
+    return True
+
+
+def say_of_points(artist: Artist, said: Iterable[str]) -> None:
+    """Keep what a page says of each point that an artist draws, when a pointer is on it."""
+    artist.set_gid(_SAID + "\n".join(said))
+
+
+def said_of_points(figure: Figure) -> tuple[tuple[float, float, str], ...]:
+    """Return where the points of which something is said lie in the image, as parts of its size."""
+    width, height = figure.get_size_inches() * figure.dpi
+    strip = 4.0 * _MM * figure.dpi if _has_strip(figure) else 0.0
+    found = []
+    for ax in figure.axes:
+        drawn: list[tuple[str | None, Any]] = [(a.get_gid(), a.get_xydata()) for a in ax.lines]
+        drawn += [(a.get_gid(), a.get_offsets()) for a in ax.collections]
+        for gid, data in drawn:
+            if gid and gid.startswith(_SAID):
+                places = ax.transData.transform(np.asarray(data, dtype=np.float64))
+                said = gid.removeprefix(_SAID).split("\n")
+                for (x, y), text in zip(places, said, strict=True):
+                    found.append((x / width, (height - y) / (height + strip), text))
+    return tuple(found)
+
+
 def caption(figure: str, **facts: Any) -> str:
     """Say what a figure shows, by the words of ``captions.j2``."""
     return words("captions.j2", "calib.report.figures", figure=figure, **facts)
@@ -160,13 +213,17 @@ def pdf_bytes(figure: Figure) -> bytes:
 def _saved(figure: Figure, **form: Any) -> bytes:
     """Return a figure as a file of some form, drawn in the project's style."""
     content = io.BytesIO()
-    if any(text.get_position()[1] < 0.0 for text in figure.texts):
+    if _has_strip(figure):
         # The mark of its data stands in a strip below it, where it meets no label.
         width, height = figure.get_size_inches()
         form |= {"bbox_inches": Bbox([[0.0, -4.0 * _MM], [width, height]]), "pad_inches": 0.0}
     with style():
         figure.savefig(content, **form)
     return content.getvalue()
+
+
+def _has_strip(figure: Figure) -> bool:
+    return any(text.get_position()[1] < 0.0 for text in figure.texts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,6 +234,7 @@ class Plate:
     name: str  # stem of its file
     caption: str  # what it shows, in words and numbers
     heading: str = ""  # what it is, in a few words
+    points: tuple[tuple[float, float, str], ...] = ()  # see `said_of_points`
 
 
 def draw_all(drawings: Mapping[str, Callable[[], Plate | None]]) -> list[Plate]:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from calib.gap.constants import LEFT, MIN_EFFECT_SIZE, MIN_EFFECT_SIZE_IN_PAIR, MOST_LEFT
@@ -44,20 +46,34 @@ def write_page(d: GapDocument, folder: Path) -> None:
 
 def _page_files(d: GapDocument) -> dict[str, bytes]:
     from calib.report.figures.gap import gap_plates
-    from calib.report.figures.style import png
+    from calib.report.figures.style import png, said_of_points, stack
 
     plates = gap_plates(d)
     images = {p.name: png(p) for p in plates if p.figure is not None}
+    plates = [
+        p if p.figure is None else replace(p, points=said_of_points(p.figure)) for p in plates
+    ]
+    narrow = {
+        p.name: png(p)
+        for p in plates
+        if p.name == "corrected" and p.figure is not None and stack(p.figure)
+    }
     return {
-        "index.html": render_page(d, plates, images).encode(),
+        "index.html": render_page(d, plates, images, narrow).encode(),
         **{f"figures/{name}.png": image for name, image in images.items()},
+        **{f"figures/{name}_narrow.png": image for name, image in narrow.items()},
     }
 
 
-def render_page(d: GapDocument, plates: Sequence[Plate], images: Mapping[str, bytes]) -> str:
+def render_page(
+    d: GapDocument,
+    plates: Sequence[Plate],
+    images: Mapping[str, bytes],
+    narrow: Mapping[str, bytes] = MappingProxyType({}),
+) -> str:
     """Render the page, which makes no request: style and images are inside.
 
-    Images are PNG files by the names of the plates.
+    Images are PNG files by the names of the plates, those for narrow screens too.
     """
     with units_of(d.headers):
         words = Words(d)
@@ -70,7 +86,10 @@ def render_page(d: GapDocument, plates: Sequence[Plate], images: Mapping[str, by
             data_label=d.label,
             verdict=verdict,
             mark=TONE_MARKS[verdict.tone],
-            figures={p.name: picture(p, images.get(p.name, b""), p.caption) for p in plates},
+            figures={
+                p.name: picture(p, images.get(p.name, b""), p.caption, narrow.get(p.name, b""))
+                for p in plates
+            },
             groups=hypothesis_groups(d),
             name=short_name,
             relevance=(LEFT, MOST_LEFT, MIN_EFFECT_SIZE, MIN_EFFECT_SIZE_IN_PAIR),

@@ -108,16 +108,18 @@ def data_uri(image: bytes) -> str:
     return f"data:image/png;base64,{base64.b64encode(image).decode()}" if image else ""
 
 
-def picture(plate: Plate, image: bytes, caption: str) -> dict[str, Any]:
+def picture(plate: Plate, image: bytes, caption: str, narrow: bytes = b"") -> dict[str, Any]:
     """Return what a template shows of a plate, `image` being its file, empty where there is none.
 
-    The caption is that of the plate as the page writes it.
+    The caption is that of the plate as the page writes it. For narrow screens there may be another.
     """
     return {
         "heading": plate.heading or plate.name.replace("_", " ").capitalize(),
         "caption": caption,
         "uri": data_uri(image),
         "size": png_size(image) if image else (0, 0),
+        "points": plate.points,
+        "narrow": data_uri(narrow),
     }
 
 

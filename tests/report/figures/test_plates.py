@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from calib.data import table_from_arrays
 from calib.data.quantities import QUANTITIES
 from calib.he2019.published import HE2019
 from calib.report.figures.bands import bands_plate, density_plate, prior_predictive_plate
+from calib.report.figures.collect import NARROW, draw
 from calib.report.figures.posterior import (
     ensembles_plate,
 )
@@ -192,3 +195,27 @@ def test_a_figure_that_fails_does_not_stop_the_rest():
     assert [(p.name, p.figure) for p in found] == [("a", None), ("b", None)]
     assert "no luck" in found[0].caption
     assert found[1].caption == "drawn"
+
+
+def test_points_say_what_was_measured_and_expected_there(rut, density):
+    """Where they lie in the image: within it, to the right with slip."""
+    for key, result in (("rut_depth", rut), ("bulk_density", density)):
+        (bands,) = (p for p in draw(key, result).plates if p.name == "bands")
+        x, y, said = zip(*bands.points, strict=True)
+        assert 0.0 < min(x) < max(x) < 1.0
+        assert 0.0 < min(y) < max(y) < 1.0
+        assert all("measured" in text and "90 % band" in text for text in said)
+    points = draw("rut_depth", rut).plates[0].points
+    assert len(points) == 27
+    assert any(text.startswith("Slip 20") and ", held out: measured" in text for _, _, text in points)
+
+
+def test_panels_are_stacked_for_narrow_screens(drawbar, density):
+    for key, result, panels in (("drawbar_pull", drawbar, 3), ("bulk_density", density, 2)):
+        files = draw(key, result).files
+        wide, narrow = (
+            Image.open(io.BytesIO(files[f"{key}_bands{which}.png"])).size for which in ("", NARROW)
+        )
+        assert wide[0] > wide[1]
+        assert narrow[0] < 0.6 * wide[0]
+        assert narrow[1] > 0.5 * panels * wide[1]
