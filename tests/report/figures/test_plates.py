@@ -207,7 +207,8 @@ def test_points_say_what_was_measured_and_expected_there(rut, density):
         assert all("measured" in text and "90 % band" in text for text in said)
     points = draw("rut_depth", rut).plates[0].points
     assert len(points) == 27
-    assert any(text.startswith("Slip 20") and ", held out: measured" in text for _, _, text in points)
+    said = [text for _, _, text in points]
+    assert any(s.startswith("Slip 20") and ", held out: measured" in s for s in said)
 
 
 def test_panels_are_stacked_for_narrow_screens(drawbar, density):
