@@ -132,6 +132,10 @@ class Outcome:
     allowed: str = ""
     not_converged: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        differ = len(self.of(Status.DIFFERENT))
+        return f"<Outcome of {self.folder}: {differ} of {len(self.items)} items differ>"
+
     def of(self, *status: Status) -> tuple[Item, ...]:
         """Return the items of some status."""
         return tuple(item for item in self.items if item.status in status)

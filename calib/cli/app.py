@@ -132,7 +132,12 @@ def start(
         bool, typer.Option("--verbose", "-v", help="Say on the error output with what versions, "
                            "what was read and how long it took; where an error came from.")
     ] = False,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", "-q", help="Say nothing but warnings and errors.")
+    ] = False,
 ) -> None:  # fmt: skip
     """Probabilistic calibration of tyre-soil models."""
+    if quiet:
+        options.silence(ctx)
     if verbose:
         ctx.with_resource(options.told())

@@ -43,6 +43,7 @@ def report(
         typer.Option(help="Model to compare with others on the same rows; two or more times."),
     ] = None,
     overwrite: opt.Overwrite = False,
+    dry_run: opt.DryRun = False,
     pdf: Annotated[bool, typer.Option("--pdf", help="Figures also as PDF, for print.")] = False,
     max_steps: opt.MaxSteps = 25_600,
     posteriors: Annotated[
@@ -60,7 +61,7 @@ def report(
     """Calibrate, predict, validate and write a report folder with an index.html."""
     from dataclasses import replace
 
-    from calib import SamplerSettings, read_table
+    from calib import SamplerSettings, build_problem, read_table
     from calib.batch.folders import claimed
     from calib.batch.pool import pool
     from calib.data.quantities import OUTPUTS
@@ -97,6 +98,11 @@ def report(
         sections = [] if only else [GapsSection(), AuditSection()]
         title = "Calibration report: He, Sandu & Osorio (2019), reconstructed data"
     settings = SamplerSettings(max_steps=max_steps)
+    if dry_run:
+        split = {task.model: fitted_rows(task) for task in tasks}
+        problems = [build_problem(t.model, split[t.model][0], t.prior_path) for t in tasks]
+        opt.planned(problems, {m: len(held or ()) for m, (_, held) in split.items()}, out)
+        return
     prepared = {task.model: (task, task.prior_path) for task in tasks}
     if compare:
         from calib.report.comparison import plan_comparison
@@ -156,6 +162,7 @@ def fit(
     seed: opt.Seed = 2019,
     hold_out: opt.HoldOutOption = None,
     overwrite: opt.Overwrite = False,
+    dry_run: opt.DryRun = False,
     max_steps: opt.MaxSteps = 25_600,
     workers: opt.Workers = opt.CORES,
     plugins: opt.Models = None,
@@ -181,6 +188,9 @@ def fit(
     settings = SamplerSettings(max_steps=max_steps)
     kept = None if hold_out is None else HoldOut.parse(hold_out)
     fitted, held = read_and_split(file, (*chosen.conditions, chosen.output), kept)
+    if dry_run:
+        opt.planned([build_problem(model, fitted, priors)], {model: len(held or ())}, out)
+        return
     emulations = emulate({model: (fitted, priors)}, seed, workers, [held])
     with progress_bars() as tell:
         problem = build_problem(model, fitted, priors)
@@ -245,6 +255,7 @@ def compare(
     seed: opt.Seed = 2019,
     hold_out: opt.HoldOutOption = None,
     overwrite: opt.Overwrite = False,
+    dry_run: opt.DryRun = False,
     max_steps: opt.MaxSteps = 25_600,
     workers: opt.Workers = opt.CORES,
     plugins: opt.Models = None,
@@ -256,6 +267,7 @@ def compare(
 
     from calib.batch.folders import claimed, drop, fresh_folder, keep
     from calib.inference.prior_files import prior_file_model
+    from calib.inference.problem import build_problem
     from calib.inference.sampler import SamplerSettings
     from calib.models import get_model
     from calib.report.comparison import text, write_comparison
@@ -271,6 +283,10 @@ def compare(
     fitted, held = read_and_split(Path(file), sorted(needed), kept)
     given = {prior_file_model(path): path for path in priors or ()}
     rows = {name: (fitted, given.get(name)) for name in models}
+    if dry_run:
+        problems = [build_problem(name, table, path) for name, (table, path) in rows.items()]
+        opt.planned(problems, dict.fromkeys(models, len(held or ())), out)
+        return
     emulations = emulate(rows, seed, workers, [held])
     with progress_bars() as tell:
         found = compare_models(

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from calib.data import Table
     from calib.inference.emulation import Emulation
+    from calib.inference.problem import Problem
 
 type Tell = Callable[[str, int, int], None]
 
@@ -33,11 +34,30 @@ HoldOutOption = Annotated[
     typer.Option("--hold-out", help="Rows kept for validation, e.g. inflation_pressure_psi=30."),
 ]
 MaxSteps = Annotated[int, typer.Option(help="Where extending the chains stops.", min=100)]
+DryRun = Annotated[
+    bool,
+    typer.Option("--dry-run", help="Check the input, say what would be done, and stop."),
+]
 PriorFiles = Annotated[list[Path] | None, typer.Option(help="Prior file of a model; repeatable.")]
 EffectsFile = Annotated[
     Path | None,
     typer.Option("--effects", help="Python file with effects of your own, for this alone."),
 ]
+
+
+class _Nowhere(io.TextIOBase):
+    """A standard output that discards what is written; JSON still goes to the real one."""
+
+    def __init__(self, output: TextIO) -> None:
+        self.output = output
+
+    def write(self, text: str) -> int:
+        return len(text)
+
+
+def silence(ctx: typer.Context) -> None:
+    """Print nothing until a command ends; warnings and errors have their own output."""
+    ctx.with_resource(redirect_stdout(_Nowhere(sys.stdout)))
 
 
 class _PlainFlags:
@@ -107,7 +127,8 @@ class _Aside(io.TextIOBase):
 
 def _set_aside(ctx: typer.Context, wanted: bool) -> bool:
     if wanted:
-        ctx.with_resource(redirect_stdout(_Aside(sys.stdout)))
+        real = sys.stdout.output if isinstance(sys.stdout, _Nowhere) else sys.stdout
+        ctx.with_resource(redirect_stdout(_Aside(real)))
     return wanted
 
 
@@ -136,6 +157,28 @@ def finish(code: int, found: Mapping[str, Any] | Path, **more: Any) -> None:
     SEEN.clear()
     if code:
         raise typer.Exit(code)
+
+
+def planned(problems: Iterable[Problem], held: Mapping[str, int], out: Path) -> None:
+    """Say what a command would calibrate, by model the rows held out, and where it would write."""
+    found = {}
+    for problem in problems:
+        model, table = problem.bound.model.name, problem.table
+        columns = [table.header_of(c) for c in (*problem.conditions, problem.bound.model.output)]
+        aside = f", {held[model]} held out" if held.get(model) else ""
+        left = f"; not used: {', '.join(table.ignored)}" if table.ignored else ""
+        print(f"{model}: {len(table)} rows of {table.source}{aside}")
+        print(f"  columns: {', '.join(columns)}{left}")
+        print(f"  parameters: {', '.join(problem.names)}; priors: {problem.priors.source}")
+        for note in problem.notes:
+            print(f"  note: {note}")
+        found[model] = {
+            "rows": len(table), "held_out": held.get(model, 0), "columns": columns,
+            "not_used": list(table.ignored), "parameters": list(problem.names),
+            "notes": list(problem.notes),
+        }  # fmt: skip
+    print(f"would write {out}; nothing was computed (--dry-run)")
+    finish(0, {"would_write": str(out), "models": found})
 
 
 def command() -> list[str]:
@@ -183,8 +226,11 @@ def told() -> Iterator[None]:
 def progress_bars() -> Iterator[Tell]:
     """Yield a callback ``(what, done, planned)`` that draws one bar for each kind of work."""
     shown: list[Progress] = []
+    quiet = isinstance(sys.stdout, _Nowhere)
 
     def tell(what: str, done: int, planned: int) -> None:
+        if quiet:
+            return
         # Not before there is something to tell: an error that comes first has the terminal alone.
         if not shown:
             shown.append(_bars())

@@ -37,6 +37,7 @@ def diagnose(
     field: Annotated[Path | None, typer.Option(help="CSV of the field campaign.")] = None,
     effects: opt.EffectsFile = None,
     overwrite: opt.Overwrite = False,
+    dry_run: opt.DryRun = False,
     workers: opt.Workers = opt.CORES,
     plugins: opt.Models = None,
     simulator: opt.Simulators = None,
@@ -49,6 +50,7 @@ def diagnose(
     from calib.batch.pool import pool
     from calib.batch.user_code import run_file
     from calib.gap.batch import INPUTS, inputs_record
+    from calib.gap.campaigns import campaigns
     from calib.gap.case import case_from_run, read_case
     from calib.gap.describe import gap_document
     from calib.gap.diagnose import diagnose as diagnose_case
@@ -77,9 +79,13 @@ def diagnose(
     considered = {**EFFECTS, **own}
     # The diagnosis looks at them too, but only after simulators have been emulated.
     check_effects(considered, given)
+    if dry_run:
+        opt.planned([o.problem for o in campaigns(given).outputs], {}, out)
+        return
     emulations = prepare_case(given, run, seed, workers)
-    with pool(workers, {} if effects is None else {effects: run_file}) as side:
-        found = diagnose_case(given, seed, effects=considered, pool=side)
+    user_code = {} if effects is None else {effects: run_file}
+    with pool(workers, user_code) as side, progress_bars() as tell:
+        found = diagnose_case(given, seed, effects=considered, pool=side, progress=tell)
     keep("diagnosis", partial(write_diagnosis, found))
     document = gap_document(found, command=opt.command())
     with fresh_folder(out, overwrite=overwrite) as folder:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, fields, replace
 from numbers import Integral
@@ -115,6 +115,9 @@ class Diagnosis(Shown):
         return f"<Diagnosis of {self.data.case.name}: {self.verdict}; {best}>"
 
 
+type Progress = Callable[[str, int, int], None]
+
+
 @takes(case=(Case, PathLike), seed=Integral, effects=Mapping)
 def diagnose(
     case: Case | str | Path,
@@ -122,6 +125,7 @@ def diagnose(
     *,
     effects: Mapping[str, Effect] = EFFECTS,
     pool: Executor = HERE,
+    progress: Progress = lambda what, done, planned: None,
 ) -> Diagnosis:
     """Find where a calibrated simulator misses, which effect it lacks, and what adding it gains.
 
@@ -135,6 +139,8 @@ def diagnose(
         The effects to consider, by name.
     pool : Executor, optional
         Where field rows are left out, if they have to be; the numbers do not depend on it.
+    progress : callable, optional
+        Called with the name of a step, steps done and steps planned.
 
     Returns
     -------
@@ -154,17 +160,29 @@ def diagnose(
     """
     if not isinstance(case, Case):
         case = read_case(Path(case))
-    return with_unseen_rows(diagnose_once(case, seed, effects), effects, pool)
+    found = diagnose_once(case, seed, effects, progress)
+    progress("leaving field rows out", 0, 1)
+    found = with_unseen_rows(found, effects, pool)
+    progress("leaving field rows out", 1, 1)
+    return found
 
 
 @one_thread()
-def diagnose_once(case: Case, seed: int, effects: Mapping[str, Effect] = EFFECTS) -> Diagnosis:
+def diagnose_once(
+    case: Case,
+    seed: int,
+    effects: Mapping[str, Effect] = EFFECTS,
+    progress: Progress = lambda what, done, planned: None,
+) -> Diagnosis:
     """Diagnose a case; how far the gap shrinks is judged on the rows it was found on.
 
     Unless there are other conditions to predict, `with_unseen_rows` has to follow.
     """
     check_effects(effects, case)
+    progress("comparing sets of causes", 0, 1)
     data, ranking, said = screened_ranking(case, seed, effects)
+    progress("comparing sets of causes", 1, 1)
+    progress("where, how far, what to measure next", 0, 1)
     mixed = mixture(data, ranking, seed)
     truth = mixed.at(data.view)
     gaps = row_gaps(data, truth)
@@ -182,6 +200,7 @@ def diagnose_once(case: Case, seed: int, effects: Mapping[str, Effect] = EFFECTS
         *_confounded(data, causes, known),
         *unusual_sizes(singles(data, _sized(case.context, known, ranking)), case.context),
     ]
+    progress("where, how far, what to measure next", 1, 1)
     return Diagnosis(
         data,
         ranking,

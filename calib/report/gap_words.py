@@ -62,6 +62,9 @@ class GapVerdict:
     headline: str
     facts: Sequence[tuple[str, str]]
 
+    def __repr__(self) -> str:
+        return f"<GapVerdict {self.state}: {self.headline}>"
+
 
 def rivals(runs: RunTrend) -> list[tuple[str, float]]:
     """Return the forms of a change over the runs that are about as probable as the first."""

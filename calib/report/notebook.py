@@ -12,7 +12,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from calib.data import Table
-from calib.data.quantities import QUANTITIES, role_of
+from calib.data.quantities import OUTPUTS, QUANTITIES, role_of
 from calib.gap.corrected import CorrectedPrediction
 from calib.gap.describe import gap_document
 from calib.gap.diagnose import Diagnosis
@@ -44,10 +44,12 @@ def _(found: Table) -> pd.DataFrame:
 @frame.register
 def _(found: Calibration) -> pd.DataFrame:
     columns = ["unit", "median", "mean", "sd", "hdi_lower", "hdi_upper", "ess_bulk", "rhat"]
+    columns += ["sd_ratio"]
     # What was sampled, then what is published of it.
     names = sorted(found.summary, key=lambda name: name not in found.problem.names)
     rows = {name: [getattr(found.summary[name], c) for c in columns] for name in names}
-    return pd.DataFrame.from_dict(rows, orient="index", columns=columns).rename_axis("parameter")
+    named = pd.DataFrame.from_dict(rows, orient="index", columns=columns).rename_axis("parameter")
+    return named.rename(columns={"sd_ratio": "sd_over_prior_sd"})
 
 
 @frame.register
@@ -63,7 +65,8 @@ def _(found: CorrectedPrediction) -> pd.DataFrame:
 @frame.register
 def _(found: Validation) -> pd.DataFrame:
     low, middle, high = np.nanquantile(found.draws, [0.05, 0.5, 0.95], axis=0)
-    columns = {"observed": found.observed, "median": middle, "90_lower": low, "90_upper": high}
+    scored = {"observed": found.observed, "median": middle, "90_lower": low, "90_upper": high}
+    columns = {n: v for n, v in found.table.columns.items() if n not in OUTPUTS.values()} | scored
     return pd.DataFrame(columns, index=pd.Index(found.table.lines, name="line"))
 
 

@@ -130,6 +130,9 @@ class Verdict:
     where: tuple[Range, ...] = ()
     held_out: str = ""
 
+    def __repr__(self) -> str:
+        return f"<Verdict {self.level.value}: {self.headline}; do not trust {self.doubt}>"
+
     @property
     def fails(self) -> tuple[str, ...]:
         """What is said of assumptions that fail."""

@@ -434,3 +434,28 @@ def test_a_prediction_never_replaces_its_conditions_nor_what_others_wrote(
         refused = calib("predict", "run", "--at", "my.csv", "--out", out, "--overwrite")
         assert_refused(refused, [out, words, "another --out"])
         assert Path(out).read_bytes() == before
+
+
+def test_a_dry_run_checks_the_input_and_computes_nothing(calib: Calib) -> None:
+    Path("my.csv").write_text(RUT)
+    ran = calib("fit", "my.csv", "--model", "modified_bekker", "--dry-run")
+    assert ran.code == 0
+    assert "rows of my.csv" in ran.out
+    assert "parameters: z_ref, n0, n1, sigma" in ran.out
+    assert "would write calib-run; nothing was computed" in ran.out
+    assert not Path("calib-run").exists()
+    Path("bad.csv").write_text(RUT.replace("rut_depth", "rut_dept"))
+    assert calib("fit", "bad.csv", "--model", "modified_bekker", "--dry-run").code == 2
+
+
+def test_quiet_leaves_warnings_and_errors(calib: Calib) -> None:
+    Path("my.csv").write_text(RUT)
+    ran = calib("-q", "fit", "my.csv", "--model", "modified_bekker")
+    assert ran.code == 0
+    assert ran.out == ""
+    assert Path("calib-run/run.json").exists()
+    shown = calib("-q", "quantities", "rut_depth", "--json")
+    assert json.loads(shown.out)["quantities"]
+    failed = calib("-q", "fit", "nowhere.csv", "--model", "modified_bekker", "--overwrite")
+    assert failed.code == 2
+    assert "nowhere.csv" in failed.err

@@ -98,6 +98,10 @@ class Emulation:
     wider: Mapping[str, float] = field(default_factory=dict)
     shifted: Mapping[str, float] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        state = "passed" if self.passed else "NOT good enough"
+        return f"<Emulation of {self.problem.bound.model.name} from {len(self.runs)} runs: {state}>"
+
     @property
     def failed(self) -> tuple[Run, ...]:
         """Runs without a value."""
