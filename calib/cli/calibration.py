@@ -262,7 +262,7 @@ def compare(
     simulator: opt.Simulators = None,
     json: opt.Json = False,
 ) -> None:
-    """Say which of several models the same data prefer, and which they cannot tell apart."""
+    """Say which of several models the same data prefer, and which they cannot distinguish."""
     from functools import partial
 
     from calib.batch.folders import claimed, drop, fresh_folder, keep

@@ -19,6 +19,7 @@ from calib.errors import CalibError
 from calib.gap.effects import EFFECTS
 from calib.models import MODELS
 from calib.models.base import BoundModel
+from calib.models.simulators.declaration import SIMULATED
 from calib.report.page.template import equation
 from tests.commands import Calib
 from tests.docs.pages import ROOT, blocks
@@ -30,7 +31,7 @@ FEW = ["--max-steps", 400]
 @pytest.fixture(autouse=True)
 def as_before() -> Iterator[None]:
     """Forget what a test registers."""
-    with forgotten(QUANTITIES, MODELS, EFFECTS):
+    with forgotten(QUANTITIES, MODELS, EFFECTS, SIMULATED):
         yield
     for name in [m for m in sys.modules if m.startswith("calib_user_")]:
         del sys.modules[name]

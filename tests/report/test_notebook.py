@@ -119,7 +119,8 @@ def test_tables_problems_and_validations_are_short_too(tmp_path):
     table = calib.load_he2019("drawbar_pull")
     _, held = calib.hold_out(table, "inflation_pressure_psi", 30)
     validation = calib.validate_held_out(calibrated(), held)
-    for found in (table, calibrated().problem, validation):
+    judged = calib.verdict(calibrated(), validation)
+    for found in (table, calibrated().problem, validation, judged):
         assert len(repr(found)) < 300
     assert len(table.to_dataframe()) == len(table)
     frame = validation.to_dataframe()
