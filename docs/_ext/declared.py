@@ -46,8 +46,12 @@ def write(folder: Path) -> None:
         if not path.is_file() or path.read_text(encoding="utf-8") != text:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8")
+    pictures = {f"models/{name}": draw for name, draw in declared_models.pictures().items()}
+    for name, draw in pictures.items():
+        if not (folder / name).is_file():  # its name says what it shows
+            (folder / name).write_bytes(draw())
     for path in folder.rglob("*.*"):
-        if path.relative_to(folder).as_posix() not in wanted:
+        if path.relative_to(folder).as_posix() not in {*wanted, *pictures}:
             path.unlink()
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -9,7 +12,10 @@ from declared_text import code, priors_table, quantity_link, table, unit, with_s
 
 from calib.data import read_for_model
 from calib.data.quantities import QUANTITIES
+from calib.inference.calibration import calibrate
+from calib.inference.problem import build_problem
 from calib.models import MODELS, Model, example_of
+from calib.report.figures.style import png_bytes
 from calib.report.labels import NOISE, model_priors
 from calib.report.page.template import parametrisation
 
@@ -35,7 +41,34 @@ def pages() -> dict[str, str]:
     return {name: _page(model) for name, model in MODELS.items()}
 
 
+def pictures() -> dict[str, Callable[[], bytes]]:
+    """Return how to draw each model fitted to its example, by the name of its file."""
+    return {_picture(m): partial(_drawn, m) for m in MODELS.values() if example_of(m)}
+
+
+def _picture(model: Model) -> str:
+    """Name the file by all that it shows."""
+    shown = _page_without_picture(model)
+    return f"{model.name}-{sha256(shown.encode()).hexdigest()[:8]}.png"
+
+
+def _drawn(model: Model) -> bytes:
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "example.csv"
+        path.write_text(example_of(model), encoding="utf-8")
+        problem = build_problem(model.name, read_for_model(path, (*model.conditions, model.output)))
+    return png_bytes(calibrate(problem, seed=1).plot())
+
+
 def _page(model: Model) -> str:
+    page = _page_without_picture(model)
+    if not example_of(model):
+        return page
+    said = f"{words(model.title)}, fitted to the example below: readings, median and bands"
+    return page.replace("## Equation", f"![{said}]({_picture(model)})\n\n## Equation", 1)
+
+
+def _page_without_picture(model: Model) -> str:
     return "\n".join(
         [
             f"# {model.name}\n",
