@@ -72,3 +72,21 @@ def test_too_many_arguments_are_for_python_to_refuse():
 def test_few_names_are_listed_and_all_are_there():
     assert len(dir(calib)) < 30
     assert all(hasattr(calib, name) for name in calib.__all__)
+
+
+def test_another_unit_than_the_calibrated_one_is_refused():
+    pulls = calib.load_he2019("drawbar_pull")
+    fitted, held = calib.hold_out(pulls, "inflation_pressure_psi", 30)
+    problem = calib.build_problem("magic_formula_pressure", fitted)
+    calibration = calib.calibrate(problem, seed=1)
+    rows = {
+        "slip_ratio": held["slip_ratio"],
+        "inflation_pressure_psi": 30.0 + 0.0 * held["slip_ratio"],
+    }
+    newtons = {**rows, "drawbar_pull_kn": 1000.0 * held["drawbar_pull_kn"]}
+    with pytest.raises(calib.CalibError, match="readings are in N or"):
+        calib.validate_held_out(calibration, newtons)
+    with pytest.raises(calib.CalibError, match="readings are in MPa"):
+        calib.predict(
+            calibration, {**rows, "inflation_pressure_psi": 0.2068 + 0.0 * rows["slip_ratio"]}
+        )

@@ -259,9 +259,7 @@ def _predict_corrected(
     import numpy as np
 
     from calib.data import read_for_model
-    from calib.data.checks import check_conditions
-    from calib.data.quantities import QUANTITIES
-    from calib.gap.corrected import covered, load_corrected, predict_columns
+    from calib.gap.corrected import check_units_of, covered, load_corrected, predict_columns
     from calib.gap.effects import EFFECTS
     from calib.gap.effects.user import load_effects
     from calib.models.simulators.files import load_files
@@ -271,11 +269,7 @@ def _predict_corrected(
     corrected = load_corrected(run, {**EFFECTS, **own})
     used = {c for o in corrected.data.outputs for c in o.problem.bound.model.conditions}
     table = read_for_model(at, sorted(used))
-    campaigns = corrected.data.case.lab, corrected.data.case.field
-    # Effects depend on conditions that the model may lack.
-    for name in sorted({*corrected.data.view.conditions} & {*table} & {*QUANTITIES}):
-        known = [t[name] for t in campaigns if name in t]
-        check_conditions(table, {name: np.concatenate(known)} if known else {})
+    check_units_of(corrected, table)
     columns = predict_columns(corrected, table, without)
     if "run_order" in corrected.data.view.conditions and "run_order" not in table:
         announce(
@@ -295,7 +289,7 @@ def _predict_corrected(
             f"no value (nan) at {nowhere} of {len(table)} rows: the simulator has none there, or "
             "explanations differ too much"
         )
-    _give(columns, out, *campaigns)
+    _give(columns, out, corrected.data.case.lab, corrected.data.case.field)
     finish(0, {"columns": _numbers(columns)}, outside=outside)
 
 

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from calib.data import Table, write_table
-from calib.data.quantities import OUTPUTS, role_of
+from calib.data.checks import check_conditions
+from calib.data.quantities import OUTPUTS, QUANTITIES, role_of
 from calib.errors import CalibError, meant
 from calib.gap.campaigns import Campaigns, campaigns
 from calib.gap.case import Context, cells, read_case, with_declared
@@ -375,6 +376,15 @@ class CorrectedPrediction(Shown):
             f"<CorrectedPrediction of {', '.join(outputs)} at {len(flags)} rows, "
             f"{sum(map(bool, flags))} outside the calibrated range>"
         )
+
+
+def check_units_of(corrected: Corrected, table: Table) -> None:
+    """Refuse conditions to predict that look, as a whole, as if they were in another unit."""
+    campaigns = corrected.data.case.lab, corrected.data.case.field
+    # Effects depend on conditions that the model may lack.
+    for name in sorted({*corrected.data.view.conditions} & {*table} & {*QUANTITIES}):
+        known = [t[name] for t in campaigns if name in t]
+        check_conditions(table, {name: np.concatenate(known)} if known else {})
 
 
 def predict_corrected(

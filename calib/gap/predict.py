@@ -6,6 +6,7 @@ from collections.abc import Collection
 from typing import TYPE_CHECKING, overload
 
 from calib.data import as_table
+from calib.data.checks import check_conditions
 from calib.data.reader import Tabular
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration
@@ -46,8 +47,8 @@ def predict(
     Raises
     ------
     CalibError
-        If a condition is missing, a cause is unknown, or causes are left out of a calibration,
-        which has none.
+        If a condition is missing or looks as if it were in another unit, a cause is unknown, or
+        causes are left out of a calibration, which has none.
 
     Examples
     --------
@@ -66,8 +67,13 @@ def predict(
                 expected="a diagnosis",
                 hint="predict with the diagnosis, or leave `without` out",
             )
+        known = found.problem.conditions
+        check_conditions(table, {name: known[name] for name in known if name in table})
         return prediction.predict(found, table)
-    from calib.gap.corrected import predict_corrected  # late: a calibration does without
+    from calib.gap.corrected import (  # late: a calibration does without
+        check_units_of,
+        predict_corrected,
+    )
     from calib.gap.diagnose import Diagnosis
 
     if not isinstance(found, Diagnosis):
@@ -77,5 +83,6 @@ def predict(
             expected="what calib.calibrate or calib.diagnose returns",
             hint="calibrate the problem first: calib.calibrate(problem, seed=1)",
         )
+    check_units_of(found.corrected, table)
     left_out = [without] if isinstance(without, str) else without
     return predict_corrected(found.corrected, table, left_out)

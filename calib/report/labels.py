@@ -35,6 +35,7 @@ _GREEK = {
     "gamma": "\N{GREEK SMALL LETTER GAMMA}",
     "nu": "\N{GREEK SMALL LETTER NU}",
     "theta": "\N{GREEK SMALL LETTER THETA}",
+    "tau": "\N{GREEK SMALL LETTER TAU}",
 }
 
 

@@ -17,6 +17,7 @@ from calib.arguments import takes
 from calib.batch.environment import one_thread
 from calib.batch.tasks import completed
 from calib.data import Table, as_table
+from calib.data.checks import check_conditions
 from calib.data.reader import Tabular
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration
@@ -89,7 +90,8 @@ def validate_held_out(calibration: Calibration, held_out: Tabular) -> Validation
     Raises
     ------
     CalibError
-        If the calibrated model has no value there, however uncertain its parameters.
+        If the calibrated model has no value there, however uncertain its parameters, or a column
+        looks, as a whole, as if it were in another unit.
 
     Notes
     -----
@@ -107,6 +109,9 @@ def validate_held_out(calibration: Calibration, held_out: Tabular) -> Validation
     'held_out'
     """
     model, held_out = calibration.problem.bound.model, as_table(held_out)
+    fitted = calibration.problem
+    known = {**fitted.conditions, model.output: fitted.table[model.output]}
+    check_conditions(held_out, {n: v for n, v in known.items() if n in held_out})
     rng = generator(calibration.seed, calibration.label, "validate")
     _, draws = predictive_draws(calibration, model.select(held_out.columns), rng)
     draws = draws[np.isfinite(draws).all(axis=1)]

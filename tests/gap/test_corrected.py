@@ -90,7 +90,7 @@ def widened(table: Table) -> Table:
     """Return a table with two columns that a case declares."""
     n = len(table)
     more = {
-        "operator": np.resize([0.0, 1.0, 2.0, 1.0], n), "tyre_temperature_c": np.linspace(8, 31, n),
+        "operator": np.resize([0.0, 1.0, 2.0, 1.0], n), "tyre_age_weeks": np.linspace(8, 31, n),
     }  # fmt: skip
     return replace(table, columns={**table.columns, **more})
 
@@ -112,7 +112,7 @@ def made() -> Corrected:
     case = replace(
         case, lab=widened(case.lab), field=widened(case.field),
         new_conditions=widened(case.new_conditions),
-        covariates={"operator": OPERATORS, "tyre_temperature_c": ()},
+        covariates={"operator": OPERATORS, "tyre_age_weeks": ()},
         priors={"rut_depth": DeclaredPriors("mine.toml", text)},
     )  # fmt: skip
     data = campaigns(case)
@@ -209,7 +209,7 @@ def test_it_must_predict_as_when_it_was_saved(kept, output, moved, refused):
 def test_a_drift_is_predicted_as_at_the_end_of_the_campaign(made):
     field = made.data.case.field
     without = table_from_arrays({k: v for k, v in field.columns.items() if k in CONDITIONS})
-    without = replace(widened(without), ignored=("operator", "tyre_temperature_c"))
+    without = replace(widened(without), ignored=("operator", "tyre_age_weeks"))
     bare = replace(made.data.case, covariates={})
     corrected = Corrected(replace(made.mixture, data=campaigns(bare)), made.lab_mode)
     at = {
@@ -233,10 +233,10 @@ def test_a_prediction_is_laid_out_by_output(made):
     case = made.data.case
     field = case.field
     words = tuple((OPERATORS[int(c)], f"{t!r}") for c, t in zip(
-        field["operator"], field["tyre_temperature_c"].tolist(), strict=True))  # fmt: skip
+        field["operator"], field["tyre_age_weeks"].tolist(), strict=True))  # fmt: skip
     words = tuple((*row, "A", f"{100 * s!r}", "1.0")
                   for row, s in zip(words, field["slip_ratio"].tolist(), strict=True))  # fmt: skip
-    header = ("operator", "tyre_temperature_c", "Site", "Slip [%]", "Drawbar pull [lbf]")
+    header = ("operator", "tyre_age_weeks", "Site", "Slip [%]", "Drawbar pull [lbf]")
     typed = replace(field, header=header, text=words)
     found = predict_columns(made, typed)
     of_outputs = [
