@@ -255,7 +255,7 @@ def test_a_users_report_says_what_failed_and_nothing_published(users):
     found = publication(manifest, summary)
     text = text_of(manifest, summary)
     assert "must not be used: R-hat of n0 is 1.3" in text
-    assert text.count("DID NOT PASS the gate") == 1
+    assert text.count("DID NOT MEET the convergence criteria") == 1
     assert not any("bulk_density" in path for path in found.files)
     assert "NOT CONVERGED" in found.files["tables/posterior_drawbar_pull.tex"]
     assert "NOT CONVERGED" not in found.files["tables/posterior_rut_depth.tex"]
