@@ -55,7 +55,7 @@ def test_it_holds_in_a_browser(report, browser):
 def test_the_page_quotes_the_methods(report):
     page = (report / "index.html").read_text(encoding="utf-8").replace("\u00a0", " ")
     text = (report / "methods.txt").read_text(encoding="utf-8")
-    sentence = re.search(r"Sampling\s+by .*? autocorrelation\s+times\.", text, re.DOTALL)
+    sentence = re.search(r"Sampling\s+by .*?\s+autocorrelation\s+times\.", text, re.DOTALL)
     assert sentence is not None
     assert " ".join(sentence[0].split()) in page
     assert 'class="copy"' in page
