@@ -289,7 +289,7 @@ def _against_cone_index(
     of_cone, of_density = axis_of(cone), axis_of(problem.bound.model.output)
     look: Any = {"cmap": _WATER, "s": 17, "edgecolor": BLACK, "linewidth": 0.4, "zorder": 4}
     points = ax.scatter(of_cone.scale(ci), of_density.scale(problem.observed), c=w, **look)
-    if result.validation is not None and result.validation.draws.shape[1] == ci.size:
+    if result.validation is not None and result.validation.method == "leave_one_out":
         expected = np.nanquantile(result.validation.draws, [0.05, 0.5, 0.95], axis=0)
         values = of_density.scale(problem.observed), of_density.scale(expected)
         said = _said(of_cone, of_density, of_cone.scale(ci), *values, "left out")
