@@ -42,6 +42,23 @@ PROBLEM = calib.build_problem("bekker", RUTS)
             lambda: calib.leave_one_out(PROBLEM),
             "calibration is of the type Problem", "calib.Calibration",
         ),
+        (lambda: calib.gap_verdict(PROBLEM), "found is of the type Problem", "calib.Diagnosis"),
+        (
+            lambda: calib.compare([PROBLEM, PROBLEM], RUTS, seed=1),
+            "a model is given as Problem, Problem", "the names of models",
+        ),
+        (
+            lambda: calib.build_problem("bekker", RUTS.to_dataframe().iloc[:0]),
+            "the table has no rows", "at least one row",
+        ),
+        (
+            lambda: calib.build_problem("bekker", {"rut_depth_mm": 3.0}),
+            "the columns are single numbers", "a list of values",
+        ),
+        (
+            lambda: calib.build_problem("bekker", {"rut_depth_mm": [3.0, "x"]}),
+            "row 1: 'x'", "a number",
+        ),
         (lambda: calib.read_case(None), "folder is of the type NoneType", "a path"),
         (lambda: calib.read_table(3), "path = 3", "a path"),
         (
@@ -90,3 +107,33 @@ def test_another_unit_than_the_calibrated_one_is_refused():
         calib.predict(
             calibration, {**rows, "inflation_pressure_psi": 0.2068 + 0.0 * rows["slip_ratio"]}
         )
+
+
+def test_rows_keep_the_labels_of_their_data_frame():
+    fitted, held = calib.hold_out(calib.load_he2019("drawbar_pull"), "inflation_pressure_psi", 30)
+    problem = calib.build_problem("magic_formula_pressure", fitted)
+    calibration = calib.calibrate(problem, seed=1)
+    shuffled = held.to_dataframe().sample(frac=1.0, random_state=2)
+    at = calib.predict(calibration, shuffled).to_dataframe()
+    assert list(at.index) == list(shuffled.index)
+    scored = calib.validate_held_out(calibration, shuffled).to_dataframe()
+    off = shuffled["drawbar_pull_kn"] - at["drawbar_pull_kn_median"]
+    assert off.std() == pytest.approx((scored["observed"] - scored["median"]).std(), abs=0.01)
+    assert off.std() < 0.2
+
+
+def test_units_are_those_of_the_file_after_a_run_was_saved(tmp_path):
+    pulls = calib.load_he2019("drawbar_pull")
+    table, _ = calib.hold_out(pulls, "inflation_pressure_psi", 30)
+    columns = {
+        "slip_percent": 100.0 * table["slip_ratio"],
+        "inflation_pressure_kpa": 6.894757 * table["inflation_pressure_psi"],
+        "drawbar_pull_n": 1000.0 * table["drawbar_pull_kn"],
+    }
+    calibration = calib.calibrate(calib.build_problem("magic_formula_pressure", columns), seed=1)
+    before = calib.verdict(calibration)
+    calib.save_calibration(calibration, tmp_path / "run")
+    after = calib.verdict(calib.load_calibration(tmp_path / "run"))
+    assert after.lines == before.lines
+    assert "kPa" in before.trust
+    assert " rms" not in before.trust

@@ -484,11 +484,13 @@ def table_from_arrays(
     for column in matched:
         kind = arrays[column.header].dtype
         if column.quantity.kind != "label" and kind.kind not in "fiub":
+            odd = next((i for i, v in enumerate(arrays[column.header]) if _is_text(v)), None)
             raise CalibError(
-                f"the values are of type {kind}, not numbers",
+                f"the values are of type {kind}, not numbers"
+                + ("" if odd is None else f" (row {odd}: {str(arrays[column.header][odd])!r})"),
                 where=f"{source}, column {column.header!r}",
                 expected=column.expected,
-                hint="pass an array of numbers",
+                hint="pass an array of numbers, as from pandas.to_numeric",
             )
     header = tuple(arrays)
     values, problems = _checked(matched, [*arrays.values()], rows, required, allow_missing)
@@ -544,9 +546,36 @@ def as_table(data: Tabular) -> Table:
     return table_from_arrays(dict(pairs))
 
 
+def _is_text(value: object) -> bool:
+    try:
+        float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        return True
+    return False
+
+
+def index_of(data: object) -> tuple[object, ...] | None:
+    """Return the labels of a data frame's rows; None of anything else."""
+    return tuple(data.index) if hasattr(data, "iloc") and hasattr(data, "index") else None
+
+
 def _common_length(arrays: Mapping[str, NDArray[Any]], source: str) -> int:
     shapes = {name: array.shape for name, array in arrays.items()}
     lengths = set(shapes.values())
+    if lengths == {(0,)}:
+        raise CalibError(
+            "the table has no rows",
+            where=source,
+            expected="at least one row",
+            hint="look at what selected the rows",
+        )
+    if lengths == {()}:
+        raise CalibError(
+            "the columns are single numbers",
+            where=source,
+            expected="a list of values in each column",
+            hint="write [10.0] for 10.0",
+        )
     if len(lengths) != 1 or len(next(iter(lengths))) != 1 or lengths == {(0,)}:
         raise CalibError(
             f"the columns have the shapes {shapes}",

@@ -228,6 +228,9 @@ def _read_file(path: Path) -> CaseFile:
             where=str(path),
             hint=f"give its folder: {folder.parent}"
             if (folder.parent / "case.toml").is_file()
+            else "it is a run folder: write a case.toml beside the two tables, or use "
+            "`calib diagnose --run RUN --field CSV`"
+            if (folder / "run.json").is_file()
             else "give a folder with a case.toml in it",
         ) from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

@@ -363,10 +363,13 @@ class CorrectedPrediction(Shown):
         By canonical column.
     columns : mapping of str to ndarray or list of str
         As `predict_columns` lays them out.
+    index : tuple, optional
+        Labels of the rows in the data frame that was given.
     """
 
     conditions: Mapping[str, Array]
     columns: Mapping[str, Array | list[str]]
+    index: tuple[object, ...] | None = None
 
     def __repr__(self) -> str:
         """Name the outputs, and say how many rows are outside."""

@@ -88,7 +88,9 @@ def _curve(found: Diagnosis, o: OutputData, column: str) -> Curve | None:
     field = {name: view.conditions[name][o.rows] for name in view.conditions}
     at = np.linspace(field[column].min(), field[column].max(), _POINTS)
     conditions = {
-        name: np.full(_POINTS, np.nanmedian(values)) for name, values in field.items()
+        # A value that was measured: between two pressures a model may know little.
+        name: np.full(_POINTS, np.nanquantile(values, 0.5, method="lower"))
+        for name, values in field.items()
     } | {column: at}
     if role_of(column) in _TOGETHER:
         known, place = np.unique(field[column], return_index=True)

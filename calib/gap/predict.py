@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import replace
 from typing import TYPE_CHECKING, overload
 
 from calib.data import as_table
 from calib.data.checks import check_conditions
-from calib.data.reader import Tabular
+from calib.data.reader import Tabular, index_of
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration
 from calib.validation import prediction
@@ -69,7 +70,7 @@ def predict(
             )
         known = found.problem.conditions
         check_conditions(table, {name: known[name] for name in known if name in table})
-        return prediction.predict(found, table)
+        return replace(prediction.predict(found, table), index=index_of(at))
     from calib.gap.corrected import (  # late: a calibration does without
         check_units_of,
         predict_corrected,
@@ -81,8 +82,8 @@ def predict(
             f"{type(found).__name__} predicts nothing",
             where="calib.predict",
             expected="what calib.calibrate or calib.diagnose returns",
-            hint="calibrate the problem first: calib.calibrate(problem, seed=1)",
+            hint="load a run folder with calib.load_calibration, or calibrate the problem first",
         )
     check_units_of(found.corrected, table)
     left_out = [without] if isinstance(without, str) else without
-    return predict_corrected(found.corrected, table, left_out)
+    return replace(predict_corrected(found.corrected, table, left_out), index=index_of(at))

@@ -139,6 +139,7 @@ class RunRecord(Record):
     prior_references: dict[str, float]
     data_source: str
     data_label: str
+    header: tuple[str, ...] = ()
     sha256: dict[File, Hash]
 
 
@@ -339,6 +340,7 @@ def _prior_group(calibration: Calibration) -> dict[str, Array]:
 def _describe(calibration: Calibration) -> dict[str, Any]:
     problem, report = calibration.problem, calibration.draws.report
     known = prior_references(problem.table.columns)
+    known_names = tuple(problem.table.columns)
     return {
         "schema": "calib/run/1",
         "model": problem.bound.model.name,
@@ -360,6 +362,8 @@ def _describe(calibration: Calibration) -> dict[str, Any]:
         "estimates": describe_estimates(calibration.estimates),
         "data_source": problem.table.source,
         "data_label": problem.table.label,
+        # Units are shown as in the file, of which the copy has other names.
+        **({"header": list(header)} if (header := problem.table.header) != known_names else {}),
         "gate": {
             "passed": report.passed,
             "reasons": list(report.reasons),
@@ -517,6 +521,8 @@ def run_problem(record: RunRecord, data: Path) -> Problem:
     table = read_for_model(data, (*model.conditions, model.output))
     # What is reconstructed stays labelled so.
     table = replace(table, source=record.data_source, label=record.data_label)
+    if record.header:
+        table = replace(table, header=record.header, text=())
     # A run holds the rows that it was calibrated on: those that the noise is measured by.
     noise = noise_of(priors.noise, model.select(table.columns), record.prior_file)
     return Problem(BoundModel(model, record.references), table, priors, noise=noise)

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from calib.arguments import takes
 from calib.data.files import plain_number
 from calib.data.quantities import OUTPUTS, QUANTITIES, physical_role, role_of
 from calib.gap.case import words_of
@@ -408,6 +409,7 @@ class Words:
         return str(self._said.terminal()).strip("\n")
 
 
+@takes(found=(Diagnosis, GapDocument))
 def gap_verdict(found: Diagnosis | GapDocument) -> GapVerdict:
     """Say in a headline and a few sentences what a diagnosis found; nothing is drawn.
 

@@ -54,12 +54,12 @@ def _(found: Calibration) -> pd.DataFrame:
 
 @frame.register
 def _(found: Prediction) -> pd.DataFrame:
-    return pd.DataFrame({**found.conditions, **band_columns(found)})
+    return pd.DataFrame({**found.conditions, **band_columns(found)}, index=found.index)
 
 
 @frame.register
 def _(found: CorrectedPrediction) -> pd.DataFrame:
-    return pd.DataFrame(dict(found.columns))
+    return pd.DataFrame(dict(found.columns), index=found.index)
 
 
 @frame.register
@@ -67,7 +67,8 @@ def _(found: Validation) -> pd.DataFrame:
     low, middle, high = np.nanquantile(found.draws, [0.05, 0.5, 0.95], axis=0)
     scored = {"observed": found.observed, "median": middle, "90_lower": low, "90_upper": high}
     columns = {n: v for n, v in found.table.columns.items() if n not in OUTPUTS.values()} | scored
-    return pd.DataFrame(columns, index=pd.Index(found.table.lines, name="line"))
+    lines = pd.Index(found.table.lines, name="line") if found.index is None else found.index
+    return pd.DataFrame(columns, index=lines)
 
 
 @frame.register

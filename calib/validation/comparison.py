@@ -243,6 +243,12 @@ def compare_problems(
 
 def check_comparable(models: Sequence[str]) -> None:
     """Raise a CalibError unless there are at least two models, all of one output."""
+    if not all(isinstance(name, str) for name in models):
+        raise CalibError(
+            f"a model is given as {', '.join(type(name).__name__ for name in models)}",
+            expected="the names of models",
+            hint='write calib.compare(["bekker", "reece"], table, seed=1)',
+        )
     if len(models) < 2 or len(set(models)) < len(models):
         raise CalibError(
             f"there is nothing to compare in {', '.join(models) or 'no model'}",

@@ -57,6 +57,8 @@ class Prediction(Shown):
     defined : ndarray, shape (n,)
         Part of the posterior for which the equation has a value there; below `MIN_DEFINED`
         median and bands are NaN.
+    index : tuple, optional
+        Labels of the rows in the data frame that was given.
     """
 
     output: str
@@ -65,6 +67,7 @@ class Prediction(Shown):
     predictive: Bands
     outside: tuple[tuple[str, ...], ...]
     defined: Array
+    index: tuple[object, ...] | None = None
 
     def __repr__(self) -> str:
         """Name the output, and say how many rows there are and how many are outside."""

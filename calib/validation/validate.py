@@ -18,7 +18,7 @@ from calib.batch.environment import one_thread
 from calib.batch.tasks import completed
 from calib.data import Table, as_table
 from calib.data.checks import check_conditions
-from calib.data.reader import Tabular
+from calib.data.reader import Tabular, index_of
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration
 from calib.inference.diagnostics import mcse, psis, tail_shape
@@ -54,6 +54,8 @@ class Validation(Shown):
         Those of `refitted` whose posterior did not pass the gate.
     elpd_rows : ndarray, shape (n,), optional
         The terms of `elpd`.
+    index : tuple, optional
+        Labels of the rows in the data frame that was given.
     """
 
     method: str
@@ -67,6 +69,7 @@ class Validation(Shown):
     elpd_se: float = float("nan")
     unconverged: tuple[int, ...] = ()
     elpd_rows: Array | None = None
+    index: tuple[object, ...] | None = None
 
     def __repr__(self) -> str:
         """Say how the rows were kept apart, and how the predictions did."""
@@ -108,7 +111,8 @@ def validate_held_out(calibration: Calibration, held_out: Tabular) -> Validation
     >>> calib.validate_held_out(calibration, held_out).method
     'held_out'
     """
-    model, held_out = calibration.problem.bound.model, as_table(held_out)
+    model, index = calibration.problem.bound.model, index_of(held_out)
+    held_out = as_table(held_out)
     fitted = calibration.problem
     known = {**fitted.conditions, model.output: fitted.table[model.output]}
     check_conditions(held_out, {n: v for n, v in known.items() if n in held_out})
@@ -124,7 +128,7 @@ def validate_held_out(calibration: Calibration, held_out: Tabular) -> Validation
         )
     observed = held_out[model.output]
     scores = score(draws, observed, heavy=calibration.problem.heavy)
-    return Validation("held_out", held_out, observed, draws, scores)
+    return Validation("held_out", held_out, observed, draws, scores, index=index)
 
 
 @takes(calibration=Calibration, settings=SamplerSettings)

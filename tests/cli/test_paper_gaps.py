@@ -25,7 +25,9 @@ def test_the_four_cases_are_written_and_can_be_diagnosed(calib: Calib) -> None:
     assert diagnosed.code == 0, diagnosed.err
     assert "verdict: effect" in diagnosed.out
     assert "slip_sinkage" in diagnosed.out
-    assert re.search(r"-> \S+ mm rms, error reduction \d+ % \(90 % interval \d+ to \d+ %\)", diagnosed.out)
+    assert re.search(
+        r"-> \S+ mm rms, error reduction \d+ % \(90 % interval \d+ to \d+ %\)", diagnosed.out
+    )
     assert re.search(r"noise sd \S+ mm\n", diagnosed.out)
     inputs = json.loads(Path("found/inputs.json").read_text())
     assert inputs["sha256"]["field"] == sha256(Path("gaps/plain_bekker/field.csv").read_bytes())
