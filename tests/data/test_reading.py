@@ -270,7 +270,7 @@ def test_arrays_are_checked_as_files_are() -> None:
         ({"slip_ratio": [0.1], "speed_m_s": [1, 2]}, "one shape"),
         ({"slip_ratio": [[0.1]]}, "flatten"),
         ({"slip_ratio": []}, "at least one row"),
-        ({}, "at least one row"),
+        ({}, "n of at least 1"),
         ({"slip": [0.1]}, "arrays, column 'slip': .*does not say the unit"),
     ],
 )
