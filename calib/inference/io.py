@@ -198,7 +198,7 @@ _OF_GATE = ("rhat", "ess_bulk", "ess_tail", "tau")
 def to_datatree(calibration: Calibration) -> xr.DataTree:
     """Return a calibration as an ArviZ DataTree.
 
-    Chains are the independently seeded ensembles, with the draws of one walker after another's
+    A chain is an independently seeded ensemble, with the draws of its walkers one after another
     (`sample_stats.walker`). Variables have `units` and `long_name`. Groups: posterior, prior,
     log_prior, posterior_predictive, log_likelihood, sample_stats, observed_data, constant_data.
 
