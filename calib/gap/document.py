@@ -34,8 +34,8 @@ type Form = Literal["drift", "step", "both", "neither"]
 
 # What the cases are, which is not what a user has.
 BENCH = (
-    "simulated campaigns of calib's own bench, whose mechanics share no formula with the "
-    "diagnosis; no measured ones"
+    "the bench is calib's own, its mechanics share no formula with the diagnosis, and it has no "
+    "measured cases"
 )
 
 

@@ -84,6 +84,18 @@ def _sure(d: GapDocument) -> bool:
     return all(c.probability >= SURE for c in d.acting)
 
 
+def _rivalled(d: GapDocument) -> bool:
+    """Whether an explanation without the causes that act is at least half as probable as the best.
+
+    Unless some cause is certain.
+    """
+    acting = {c.name for c in d.acting}
+    if not acting or any(c.probability >= SURE for c in d.acting):
+        return False
+    others = [e.probability for e in d.explanations if not acting & set(e.name.split("+"))]
+    return max(others, default=0.0) >= 0.5 * d.best.probability
+
+
 def _change(d: GapDocument) -> str:
     """Return the rule for a change over the runs that is more probable than not, if one applies."""
     if d.runs is None or d.runs.probability < 0.5:
@@ -109,7 +121,7 @@ RULES: tuple[tuple[str, Tone, Callable[[GapDocument], bool]], ...] = (
     ("over runs", Tone.CARE, lambda d: _change(d) == "over runs"),
     # There is a gap, and no listed effect explains it, or several explain it about as well.
     ("unknown", Tone.NO, lambda d: d.verdict == "unknown"),
-    ("tie", Tone.CARE, lambda d: d.verdict == "ambiguous"),
+    ("tie", Tone.CARE, lambda d: d.verdict == "ambiguous" or _rivalled(d)),
     # Causes act.
     ("recalibrate", Tone.FINE, lambda d: [c.name for c in d.acting] == ["parameter_shift"]),
     ("named", Tone.FINE, _sure),

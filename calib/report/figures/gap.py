@@ -71,13 +71,13 @@ def corrected_plate(d: GapDocument, say: Words) -> Plate | None:
         style.say_of_points(
             dots,
             (
-                f"{x.name} {short(place, 3)} {x.unit}: measured {short(value, 3)} {y.unit}"
+                f"{x.name} {short(place, 3)} {x.unit}: {short(value, 3)} {y.unit}, adjusted"
                 for place, value in zip(*where, strict=True)
             ),
         )
         ax.set(xlabel=x.label, ylabel=y.label)
         handles = {
-            "field readings": dots,
+            "field readings, adjusted to these conditions": dots,
             "calibrated in the laboratory": old,
             "corrected": new,
             "90 % band of the corrected": band,
