@@ -50,7 +50,7 @@ from calib.inference.io import (
 from calib.inference.problem import Problem
 from calib.inference.sampler import SamplerSettings
 from calib.report import comparison
-from calib.report.comparison import FILE, ComparisonRecord, problem_of, recompute_comparison
+from calib.report.comparison import FILE, ComparisonRecord, recompute_comparison
 from calib.report.page.diagnosis import render_diagnosis
 from calib.validation.comparison import stacking_weights
 
@@ -229,7 +229,7 @@ def check_comparison(record: ComparisonRecord, job: Job) -> list[Item]:
         jobs = {name: job.inside(f"runs/{name}") for name in record.models}
         runs = {name: read_record(RunRecord, of.folder) for name, of in jobs.items()}
         data = {name: of.folder / DATA for name, of in jobs.items()}
-        problems = {name: problem_of(run, data[name], record) for name, run in runs.items()}
+        problems = {name: run_problem(run, data[name]) for name, run in runs.items()}
         for name, run in runs.items():
             found = _verify_run(run, jobs[name].folder)
             found += _consistent_run(run, problems[name], jobs[name])

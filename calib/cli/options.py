@@ -45,11 +45,11 @@ EffectsFile = Annotated[
 ]
 
 
-class _Nowhere(io.TextIOBase):
-    """A standard output that discards what is written; JSON still goes to the real one."""
+class _Aside(io.TextIOBase):
+    """A standard output that discards text; the JSON document, if one is asked for, is printed."""
 
-    def __init__(self, output: TextIO) -> None:
-        self.output = output
+    def __init__(self, output: TextIO, *, json: bool = True) -> None:
+        self.output, self.json = output, json
 
     def write(self, text: str) -> int:
         return len(text)
@@ -57,7 +57,7 @@ class _Nowhere(io.TextIOBase):
 
 def silence(ctx: typer.Context) -> None:
     """Print nothing until a command ends; warnings and errors have their own output."""
-    ctx.with_resource(redirect_stdout(_Nowhere(sys.stdout)))
+    ctx.with_resource(redirect_stdout(_Aside(sys.stdout, json=False)))
 
 
 class _PlainFlags:
@@ -115,19 +115,9 @@ Simulators = Annotated[
 ]
 
 
-class _Aside(io.TextIOBase):
-    """A standard output that discards text, so that only the JSON document is printed."""
-
-    def __init__(self, output: TextIO) -> None:
-        self.output = output
-
-    def write(self, text: str) -> int:
-        return len(text)
-
-
 def _set_aside(ctx: typer.Context, wanted: bool) -> bool:
     if wanted:
-        real = sys.stdout.output if isinstance(sys.stdout, _Nowhere) else sys.stdout
+        real = sys.stdout.output if isinstance(sys.stdout, _Aside) else sys.stdout
         ctx.with_resource(redirect_stdout(_Aside(real)))
     return wanted
 
@@ -147,7 +137,7 @@ def finish(code: int, found: Mapping[str, Any] | Path, **more: Any) -> None:
     """
     from calib.data.reader import SEEN, said_of
 
-    if isinstance(sys.stdout, _Aside):
+    if isinstance(sys.stdout, _Aside) and sys.stdout.json:
         document = found if isinstance(found, Mapping) else json.loads(found.read_bytes())
         data = {"data_label": ", ".join(SEEN)} if SEEN else {}
         whole = finite({"exit_code": code, **more, **data, **document})
@@ -226,7 +216,7 @@ def told() -> Iterator[None]:
 def progress_bars() -> Iterator[Tell]:
     """Yield a callback ``(what, done, planned)`` that draws one bar for each kind of work."""
     shown: list[Progress] = []
-    quiet = isinstance(sys.stdout, _Nowhere)
+    quiet = isinstance(sys.stdout, _Aside) and not sys.stdout.json
 
     def tell(what: str, done: int, planned: int) -> None:
         if quiet:

@@ -32,7 +32,7 @@ from pydantic import (
 
 from calib.arguments import takes
 from calib.batch.environment import Environment, differs_in_lines, sha256
-from calib.data import read_for_model, write_table
+from calib.data import Table, read_for_model, write_table
 from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError, in_words
 from calib.inference.calibration import Calibration, calibrate
@@ -337,10 +337,14 @@ def _prior_group(calibration: Calibration) -> dict[str, Array]:
     return {name: both[name][None] for name in calibration.parameters}
 
 
+def own_names(table: Table) -> dict[str, Any]:
+    """Return the file's own column names, where they are not those of the copy that is kept."""
+    return {} if table.header == tuple(table.columns) else {"header": list(table.header)}
+
+
 def _describe(calibration: Calibration) -> dict[str, Any]:
     problem, report = calibration.problem, calibration.draws.report
     known = prior_references(problem.table.columns)
-    known_names = tuple(problem.table.columns)
     return {
         "schema": "calib/run/1",
         "model": problem.bound.model.name,
@@ -363,7 +367,7 @@ def _describe(calibration: Calibration) -> dict[str, Any]:
         "data_source": problem.table.source,
         "data_label": problem.table.label,
         # Units are shown as in the file, of which the copy has other names.
-        **({"header": list(header)} if (header := problem.table.header) != known_names else {}),
+        **own_names(problem.table),
         "gate": {
             "passed": report.passed,
             "reasons": list(report.reasons),

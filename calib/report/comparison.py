@@ -31,10 +31,9 @@ from calib.inference.io import (
     Hash,
     KnownModel,
     Record,
-    RunRecord,
     load_calibration,
+    own_names,
     read_record,
-    run_problem,
     save_calibration,
 )
 from calib.inference.problem import Problem, build_problem
@@ -49,7 +48,7 @@ from calib.report.page.template import data_uri, equation, template
 from calib.report.sections import Section, Target, coverage_words
 from calib.report.study import Progress, Study, Task, fitted_rows
 from calib.report.verdict import Verdict, keep_verdict, kept_verdict, verdict
-from calib.report.writer import file_hashes, own_names
+from calib.report.writer import file_hashes
 from calib.validation.comparison import (
     Candidate,
     Comparison,
@@ -411,17 +410,6 @@ def recompute_comparison(
     again = replace(again, candidates=tuple(by_name[name] for name in record.models))
     write_comparison(again, out, record.command, record.held_out, environment=record.environment)
     return again
-
-
-def problem_of(run: RunRecord, data: Path, record: ComparisonRecord) -> Problem:
-    """Return a run's problem, its columns named as in the file that was compared on.
-
-    Units are shown by these names, where they are not those of the copy that is kept.
-    """
-    problem = run_problem(run, data)
-    if not record.header:
-        return problem
-    return problem.with_table(replace(problem.table, header=record.header, text=()))
 
 
 FOLDER = "compared"

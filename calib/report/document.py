@@ -20,7 +20,7 @@ from calib.models.base import Array
 from calib.report.labels import Axis, axis_of, units_of
 from calib.report.numbers import finite
 from calib.report.reference import Reference, reference_of
-from calib.report.rows import held_table, x_column
+from calib.report.rows import held_table
 from calib.report.study import HoldOut, OutputResult, Study
 from calib.report.verdict import checks_passed, judge_evidence
 from calib.validation.comparison import NoisePreference
@@ -311,7 +311,6 @@ def page_facts(result: OutputResult, emulator_fails: Sequence[str] = ()) -> dict
         "checks": checks_passed(evidence),
         "judged": int(judged.sum()),
         "worst": {} if worst is None else {c: v.table[c][worst] for c in problem.conditions},
-        "along": x_column(result),
         "distinct": None if held is not None else np.unique(conditions, axis=0).shape[0],
         "held": 0 if held is None else len(held),
         "ranges": ranges,

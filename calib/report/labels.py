@@ -193,8 +193,8 @@ def odds_text(p: float) -> str:
 
 
 def joined(words: list[str]) -> str:
-    """Join words as a sentence does."""
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+    """Join words as a sentence does; none give nothing."""
+    return "".join(words) if len(words) < 2 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 def unbroken(text: str) -> str:

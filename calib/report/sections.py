@@ -130,7 +130,7 @@ def coverage_words(share: float, n: int) -> str:
     found = f"{100 * share:.0f} % (95 % interval {100 * low:.0f} to {100 * high:.0f} %): "
     if high < 0.9:
         return f"{found}too narrow"
-    return found + ("wider than need be" if low > 0.9 else "as they should be")
+    return found + ("wider than necessary" if low > 0.9 else "as they should be")
 
 
 def emulation_words(d: Document) -> str:

@@ -17,10 +17,10 @@ from markupsafe import Markup
 from calib.batch.environment import Environment, sha256
 from calib.batch.folders import fresh_folder
 from calib.batch.pool import HERE
-from calib.data import Table, write_table
+from calib.data import write_table
 from calib.data.files import read_text
 from calib.inference.estimators import GeneticSettings, method_name
-from calib.inference.io import save_posterior
+from calib.inference.io import own_names, save_posterior
 from calib.inference.prior_files import default_priors
 from calib.inference.sampler import SamplerSettings
 from calib.models import MODELS, get_model
@@ -186,11 +186,6 @@ def _keep(key: str, result: OutputResult, folder: Path) -> None:
     save_posterior(result.calibration, folder / f"{key}.nc")
 
 
-def own_names(table: Table) -> dict[str, Any]:
-    """Return the file's own column names, where they are not those of the copy that is kept."""
-    return {} if table.header == tuple(table.columns) else {"header": list(table.header)}
-
-
 def _copy_inputs(study: Study, folder: Path) -> dict[str, dict[str, Any]]:
     """Copy data and priors into the report, so that it can be computed again from itself."""
     (folder / "data").mkdir()
@@ -237,13 +232,16 @@ def _cell(text: str, ticks: bool = False) -> Markup:
 
 
 def identified_words(o: Output) -> str:
-    """Say in a line which sampled parameters the data do not identify."""
+    """Say in a line which sampled parameters the priors decide, and which they move."""
     known = o.found["prior_sensitivity"]["parameters"]
     sampled = [s.name for s in o.posterior if s.sd_ratio == s.sd_ratio and s.name in known]
-    unknown = [plain(name) for name in sampled if not known[name]["identified"]]
-    if not unknown:
-        return f"the data identify all {len(sampled)} parameters"
-    return f"the data do not identify {joined(unknown)}, so their priors decide"
+    unknown, moved = (
+        joined([plain(name) for name in sampled if known[name]["reading"] == reading])
+        for reading in ("not identified", "data and prior")
+    )
+    said = [f"the data do not identify {unknown}, so their priors decide"] if unknown else []
+    said += [f"the prior also moves {moved}"] if moved else []
+    return "; ".join(said) or f"the data identify all {len(sampled)} parameters"
 
 
 def _section(o: Output, result: OutputResult, drawn: Drawn | None) -> dict[str, Any]:

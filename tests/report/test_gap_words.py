@@ -14,7 +14,7 @@ from calib.report.gap_words import RULES, Tone, Words, chance, gap_verdict, judg
 from calib.report.labels import odds_text
 from calib.report.page.diagnosis import render_page
 from tests.pages import Reader
-from tests.report.gap_documents import DOCUMENTS, PULL, RUNS, gap
+from tests.report.gap_documents import DOCUMENTS, LUGS, PULL, RUNS, gap
 
 MACROS = ("covered", "prior")
 
@@ -57,6 +57,21 @@ def test_the_rules_are_ten_and_each_decides_once():
 def test_what_decides(changes, tone, rule):
     d = replace(gap("effect", {"lug_thrust": 0.93}), **changes)
     assert judge(d) == (tone, rule)
+
+
+@pytest.mark.parametrize(
+    ("explanations", "cause", "rule"),
+    [
+        ({"lug_thrust": 0.6, "sensor_drift": 0.25}, 0.6, "likely"),
+        ({"lug_thrust": 0.6, "sensor_drift": 0.35}, 0.6, "tie"),
+        # Every explanation that is half as probable has the cause, or the cause is certain.
+        ({"lug_thrust": 0.5, "lug_thrust+sensor_drift": 0.4}, 0.9, "named"),
+        ({"lug_thrust": 0.4, "lug_thrust+sensor_drift": 0.15, "sensor_drift": 0.25}, 0.55, "tie"),
+    ],
+)
+def test_a_cause_with_a_rival_about_as_probable_is_not_named(explanations, cause, rule):
+    d = gap("effect", explanations, causes=(replace(LUGS, probability=cause),))
+    assert judge(d)[1] == rule
 
 
 @pytest.mark.parametrize("name", DOCUMENTS)

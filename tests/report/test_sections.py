@@ -52,7 +52,7 @@ def test_emulators_and_failed_runs_are_listed() -> None:
     [
         (0.77, 200, "77 % (95 % interval 71 to 82 %): too narrow"),
         (0.84, 20, "84 % (95 % interval 65 to 96 %): as they should be"),
-        (1.0, 200, "100 % (95 % interval 99 to 100 %): wider than need be"),
+        (1.0, 200, "100 % (95 % interval 99 to 100 %): wider than necessary"),
     ],
 )
 def test_the_coverage_of_an_emulator_is_judged(share: float, n: int, words: str) -> None:

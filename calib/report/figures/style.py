@@ -54,7 +54,7 @@ def _settings() -> Mapping[Any, Any]:
     return {name: value for name, value in found.items() if name != "backend"}
 
 
-class Drawn(Figure):
+class NotebookFigure(Figure):
     """A figure that a notebook shows, even where nothing has imported pyplot."""
 
     def _repr_png_(self) -> bytes:
@@ -88,7 +88,7 @@ def panels(
     them. What else is given is for `Figure.subplots`.
     """
     total = top + bottom + rows * height + (rows - 1) * gap_y
-    figure = Drawn(figsize=(width * _MM, total * _MM))
+    figure = NotebookFigure(figsize=(width * _MM, total * _MM))
     axes = figure.subplots(rows, cols, squeeze=False, **how)
     figure.subplots_adjust(
         left=left / width,
