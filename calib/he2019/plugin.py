@@ -34,7 +34,9 @@ class Plugin:
             return
         some, said = (
             "Some of the data",
-            "are reconstructed from published results [@He_2019]; they are not measurements.",
+            "are reconstructed from published results [@He_2019], so that the published estimates "
+            "fit them best. They are not measurements: that the models fit follows from how they "
+            "were made.",
         )
         register(
             KnownData(LABEL, "the embedded data", f"The data {said}", embedded.holds),

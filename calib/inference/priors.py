@@ -162,6 +162,16 @@ class Priors:
             values[:, j] = np.log(np.maximum(x, 1e-300))
         return np.asarray(np.clip(values, lower, upper))
 
+    def central(self, level: float) -> dict[str, tuple[float, float]]:
+        """Return each free parameter's central interval of a level, in natural values."""
+        tail = np.array([[0.5 - 0.5 * level], [0.5 + 0.5 * level]])
+        ends = self.to_natural(self.ppf(np.repeat(tail, len(self.free), axis=1)))
+        return {
+            p.name: (float(low), float(high))
+            for p, low, high in zip(self.entries, *ends, strict=True)
+            if not p.fixed
+        }
+
     def sample(self, rng: np.random.Generator, size: int) -> Array:
         """Draw internal coordinates, shape (size, d)."""
         return self.ppf(rng.uniform(size=(size, len(self.free))))

@@ -310,9 +310,10 @@ def page_facts(result: OutputResult, emulator_fails: Sequence[str] = ()) -> dict
         "verdict": judge_evidence(evidence),
         "checks": checks_passed(evidence),
         "judged": int(judged.sum()),
-        "worst": {} if worst is None else {c: v.table[c][worst] for c in problem.conditions},
+        "worst": {} if worst is None else {c: v.table[c][worst] for c in names},
         "distinct": None if held is not None else np.unique(conditions, axis=0).shape[0],
         "held": 0 if held is None else len(held),
         "ranges": ranges,
+        "priors": problem.priors.central(0.95),
         "stored": result.calibration.draws.t.shape[1:3],
     }

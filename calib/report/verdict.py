@@ -79,7 +79,7 @@ class Evidence:
     max_relative_error: float  # NaN where no row is large enough to be judged
     prior_set: Sequence[str]  # parameters whose width is the prior's
     two_pressures: bool  # whether a quadratic in pressure was calibrated at two pressures
-    skill: float  # part of the scatter about the calibrated mean that the median removes
+    null_rmse: float  # of the calibrated rows' mean, which knows no condition
     sign_changes: int  # of the residuals along the curve
     neighbours: int
     along: str  # the condition that the curve runs along
@@ -98,6 +98,11 @@ class Evidence:
     # The same errors of fitted rows, each left out in turn, where others were held out.
     loo_rmse: float = math.nan
     loo_max_relative_error: float = math.nan
+
+    @property
+    def skill(self) -> float:
+        """Part of the scatter about the calibrated mean that the median removes."""
+        return 1.0 - (self.rmse / self.null_rmse) ** 2 if self.null_rmse > 0.0 else math.nan
 
 
 @dataclass(frozen=True)
@@ -374,11 +379,11 @@ def _unseen(problem: Problem, v: Validation | None) -> dict[str, Any]:
     """Return what was found on rows that were not fitted."""
     nothing = float("nan")
     if v is None:
-        scores = {"effective": nothing, "skill": nothing, **_errors(problem, v)}
+        scores = {"effective": nothing, "null_rmse": nothing, **_errors(problem, v)}
         return {"hits": 0, "n": 0, "low_coverage_p": 1.0, **scores}
     covered = v.scores.coverage[0.9]
     complete = bool(np.isfinite(v.draws).all(axis=1).any())
-    scatter = float(np.mean(np.square(v.observed - problem.observed.mean())))
+    null = float(np.sqrt(np.mean(np.square(v.observed - problem.observed.mean()))))
     if complete and v.method == "held_out":
         # Held-out rows share a curve, so the binomial law would raise false alarms.
         low_coverage_p = coverage_probability(v.draws, covered.hits, 0.9)
@@ -390,7 +395,7 @@ def _unseen(problem: Problem, v: Validation | None) -> dict[str, Any]:
         "low_coverage_p": low_coverage_p,
         "effective": effective_rows(v.draws) if complete else nothing,
         **_errors(problem, v),
-        "skill": 1.0 - v.scores.rmse**2 / scatter if scatter > 0.0 else nothing,
+        "null_rmse": axis_of(problem.bound.model.output).factor * null,
     }
 
 

@@ -32,7 +32,7 @@ from calib.report.markup import prose, to_html
 from calib.report.numbers import TIMES
 from calib.report.page.template import equation, parametrisation, picture, template
 from calib.report.publish import Publication, likelihood, publication
-from calib.report.publish.tables import TICK, TOPICS, parameters_table
+from calib.report.publish.tables import TICK, TOPICS, chains_table, parameters_table
 from calib.report.sections import Report, Section, Target, emulation_words
 from calib.report.study import OutputResult, Progress, Study, Task, silent
 from calib.report.verdict import Level
@@ -263,7 +263,10 @@ def _section(o: Output, result: OutputResult, drawn: Drawn | None) -> dict[str, 
         "likelihood": to_html(likelihood(o)),
         "parametrisation": said(parametrisation(bound.model.parametrisation, bound.references)),
         "tables": {name: topic.of_output(o) for name, topic in TOPICS.items()},
+        "letters": to_html(bound.model.letters),
         "parameters": parameters_table(o),
+        "derived": len(parameters_table(o).groups[-1]) > 0,
+        "by_chain": chains_table(o),
         "identified": said(identified_words(o)),
         "methods": joined([method_name(m) for m in o.found["estimates"]]) or "none",
         "figures": {

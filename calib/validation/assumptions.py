@@ -47,13 +47,25 @@ def remarks_of(calibration: Calibration) -> tuple[Remark, ...]:
     return (
         *(remark("outlying", note=note) for note in outlying_notes(problem, t)),
         *file_remarks(problem, float(problem.theta(t[None])[0, -1])),
-        *((remark("unit_first"),) if any(column_notes(problem.table)) else ()),
+        *((remark("unit_first"),) if any(column_notes(problem.table)) else _surprising(calibration)),
         *(
             remark("pressed", name=n, bound=plain_number(b), beyond=_beyond(calibration, n))
             for n, b in _bounds_pressed(calibration).items()
         ),
         *cut_off(problem, calibration.draws.flat),
     )
+
+
+def _surprising(calibration: Calibration) -> Iterator[Remark]:
+    """Parameters that the data put where their priors have less than 2.5 % of their mass."""
+    for name, (low, high) in calibration.problem.priors.central(0.95).items():
+        s = calibration.summary[name]
+        if s.sd_ratio <= PRIOR_SET and not low <= s.median <= high:
+            found, expected = (
+                f"{plain_number(a, 2)} to {plain_number(b, 2)}"
+                for a, b in ((s.hdi_lower, s.hdi_upper), (low, high))
+            )
+            yield remark("surprising", name=name, found=found, expected=expected)
 
 
 def cut_off(problem: Problem, draws: Array) -> Iterator[Remark]:
@@ -232,12 +244,12 @@ def file_remarks(problem: Problem, scatter: float) -> tuple[Remark, ...]:
     for name, values in problem.conditions.items():
         quantity = QUANTITIES[name]
         if np.unique(values).size == 1:
-            found.append(remark("constant", source=source, word=word_of(table, quantity)))
+            found.append(remark("constant", word=word_of(table, quantity)))
         found += [remark("unit", note=note) for note in unit_notes(table, quantity, values)]
     # Rows at fewer different conditions than there are parameters, however many rows.
     settings = len(np.unique(np.stack([*problem.conditions.values()], axis=1), axis=0))
     if settings < (free := _n_free(problem)):
-        found.append(remark("few_settings", source=source, settings=settings, free=free))
+        found.append(remark("few_settings", settings=settings, free=free))
     copied = _copies(problem, scatter)
     if n := int(copied.sum()):
         rows = "this row repeats" if n == 1 else f"these {n} rows repeat"

@@ -278,7 +278,6 @@ def _uneven(problem: Problem, residual: Array) -> Iterator[Check]:
             continue
         quantity, column = QUANTITIES[name], problem.table.column(name)
         words: dict[str, Any] = {
-            "source": source_of(problem.table),
             "stem": quantity.stem,
             "word": word_of(problem.table, quantity),
         }
@@ -308,7 +307,7 @@ def _heavy_tailed(problem: Problem, residual: Array) -> Iterator[Check]:
         return
     p = float(scipy.stats.kurtosistest(residual, alternative="greater").pvalue)
     kurtosis = scipy.stats.kurtosis(residual)
-    yield Check(p, remark("heavy", source=source_of(problem.table), kurtosis=kurtosis))
+    yield Check(p, remark("heavy", kurtosis=kurtosis))
 
 
 class OutlyingRow(NamedTuple):

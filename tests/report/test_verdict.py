@@ -38,7 +38,7 @@ FINE = Evidence(
     max_relative_error=0.08,
     prior_set=(),
     two_pressures=False,
-    skill=0.9,
+    null_rmse=0.13,
     sign_changes=12,
     neighbours=26,
     along="slip",
@@ -57,7 +57,7 @@ RULES = {
     "unexpected": {"prior_hits": 2, "prior_n": 20},
     "extrapolated": {"two_pressures": True, "prior_set": ("K_bend", "D_bend")},
     "few": {"hits": 1, "n": 1},
-    "weak": {"skill": 0.1},
+    "weak": {"null_rmse": 0.042},
 }
 
 
@@ -123,7 +123,7 @@ def test_a_doubt_is_told_of_the_rows_that_it_concerns(psi, told):
 
 def test_what_fails_at_one_pressure_is_told_there_alone():
     range_ = Range("inflation_pressure_psi", 18.0, 18.0)
-    remark = Remark("one sigma is too narrow at 18 psi", "Scatter is uneven", where=(range_,))
+    remark = Remark("one sigma is too small at 18 psi", "Scatter is uneven", where=(range_,))
     evidence = replace(FINE, checks=(Check(0.0024, remark),))
     found = judge_evidence(evidence)
     assert (found.rule, found.level, found.fails) == ("assumption", Level.CARE, (remark.text,))
@@ -162,7 +162,7 @@ def test_evidence_of_the_held_out_pressure(drawbar):
     verdict = judge_evidence(evidence)
     # What fails comes before what the prior sets, which is doubted all the same.
     assert verdict.headline == "Scatter is uneven"
-    assert "one sigma is too narrow at 18 psi" in verdict.fails[0]
+    assert "one sigma is too small at 18 psi" in verdict.fails[0]
     assert verdict.trust == "the median at 18 and 42 psi for slip 2 to 72 %"
     assert "two pressures do not determine a quadratic" in verdict.doubt
     assert judge_evidence(replace(evidence, checks=())).rule == "extrapolated"

@@ -197,6 +197,15 @@ def test_residuals_are_not_judged_while_a_column_looks_to_be_in_another_unit() -
     assert "is not judged while a column looks to be in another unit" in withheld
 
 
+@pytest.mark.parametrize(("mean", "told"), [(2.0, False), (1.9, False), (1.6, True)])
+def test_a_posterior_at_the_edge_of_its_prior_is_told(mean: float, told: bool) -> None:
+    """The slope is 2; its prior has 95 % within 0.3 of its mean."""
+    found = calibrated(normal("b", mean, 0.3 / stats.norm.ppf(0.975)), SLIP, LINE)
+    said = " ".join(remark.text for remark in remarks_of(found))
+    expected = f"prior {mean - 0.3:.2g} to {mean + 0.3:.2g} (95 % each)"
+    assert ("move b to the edge of its prior" in said and expected in said) is told
+
+
 def test_copies_are_named_by_line() -> None:
     table = rut()
     found = notes_of(table.take(np.append(np.arange(12), [3, 3, 5])))

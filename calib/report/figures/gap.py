@@ -501,4 +501,4 @@ def gap_plates(d: GapDocument, names: Sequence[str] = ()) -> list[Plate]:
         say = Words(d)
         drawings = {name: partial(_DRAWINGS[name], d, say) for name in names or _DRAWINGS}
         plates = style.draw_all(drawings)
-    return style.marked(plates, d.label)
+    return list(style.marked(plates, d.label))

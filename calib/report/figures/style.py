@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from typing import Any
@@ -252,13 +252,12 @@ def mark(figure: Figure, label: str) -> None:
         figure.text(0.995, below, text, ha="right", va="top", fontsize=7, color="0.35")
 
 
-def marked(plates: Sequence[Plate], label: str) -> list[Plate]:
-    """Return plates that say what their data are, in the figure and below it."""
+def marked(plates: Sequence[Plate], label: str) -> Sequence[Plate]:
+    """Return plates whose figures say what their data are."""
     for plate in plates:
         if plate.figure is not None:
             mark(plate.figure, label)
-    said = f" {label.capitalize()} data." if label else ""
-    return [replace(plate, caption=f"{plate.caption}{said}") for plate in plates]
+    return plates
 
 
 def _attempt(name: str, draw: Callable[[], Plate | None]) -> Plate | None:

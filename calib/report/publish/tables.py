@@ -138,7 +138,7 @@ def _sampled_and_derived(o: Output) -> tuple[list[ParameterSummary], list[Parame
 
 def parameters_table(o: Output) -> Table:
     """Return what a page says first of the parameters: meaning, posterior, what identifies each."""
-    known = o.found["prior_sensitivity"]["parameters"]
+    known, priors = o.found["prior_sensitivity"]["parameters"], o.facts["priors"]
     meanings = {"sigma": "standard deviation of the noise", **o.model.meanings}
 
     def row(s: ParameterSummary) -> Row:
@@ -147,16 +147,25 @@ def parameters_table(o: Output) -> Table:
         return {
             "Parameter": _named(s.name, s.unit),
             "Meaning": meanings.get(s.name, NOTHING),
+            "Prior, 95 %": " to ".join(_number(end, 2) for end in priors.get(s.name, (None,))),
             "Posterior": centre_text(s),
             "95 % HDI": interval_text(s),
             "Identified by": said if sure else f"[!{said}]",
         }
 
     groups = [[row(s) for s in group] for group in _sampled_and_derived(o)]
-    return Table(f"parameters_{o.key}", "", "llrrl", groups)
+    return Table(f"parameters_{o.key}", "", "llrrrl", groups)
 
 
-def _posterior_row(s: ParameterSummary) -> Row:
+def chains_table(o: Output) -> Table:
+    """Return what a page says of convergence by parameter: the posterior is said before."""
+    groups = [[_posterior_row(s) for s in group] for group in _sampled_and_derived(o)]
+    for row in (row for group in groups for row in group):
+        del row["Posterior"], row["95 % HDI"]
+    return Table(f"chains_{o.key}", "", "lrrrr", groups)
+
+
+def _posterior_row(s: ParameterSummary) -> dict[str, str]:
     return {
         "Parameter": _named(s.name, s.unit),
         "Posterior": centre_text(s),

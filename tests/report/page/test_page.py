@@ -65,14 +65,15 @@ def test_the_verdict_comes_first(whole):
     assert reader.ids[0] == "verdict"
     start = reader.text.index("Verdict")
     opening = reader.text[start : reader.text.index("How to reproduce", start)]
-    for words in ("Scatter is uneven", "too narrow", "in the 90 % band", "Do not trust:"):
+    for words in ("Scatter is uneven", "too small at 18 psi", "in the 90 % band", "Do not trust:"):
         assert words in opening
 
 
 def test_only_reconstructed_data_are_called_so(whole, plate):
     html, reader = whole
-    assert html.count('class="badge"') == 1 + 3
-    assert "They are not\nmeasurements" in reader.text
+    # The note, and each output's card and heading.
+    assert html.count('class="badge"') == 1 + 3 + 3
+    assert "They are not measurements" in " ".join(reader.text.split())
     html, reader = page({"rut_depth": plate})
     assert "econstructed" not in html
     assert "Table 6" not in reader.text
