@@ -717,6 +717,8 @@ def _next(found: Diagnosis, m: NextMeasurement) -> doc.Next:
         tuple(columns),
         "order" in roles & measured,
         repeats_needed(m.gain_nats),
+        m.output,
+        m.expected,
     )
 
 

@@ -7,7 +7,7 @@ again without any fit. Values are in canonical units.
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.resources import files
@@ -317,6 +317,10 @@ class Next:
         Whether it is best made after the last run.
     repeats : int or None
         Readings for expected odds of twenty to one; None where that is out of reach.
+    output : str
+        The one that tells most there; empty in a document of before.
+    expected : sequence of pairs of float
+        Mean and sd of one reading of it under either explanation, in its canonical unit.
     """
 
     separates: tuple[str, str]
@@ -325,6 +329,8 @@ class Next:
     matters: tuple[str, ...] = ()
     last: bool = False
     repeats: int | None = None
+    output: str = ""
+    expected: Sequence[tuple[float, float]] = ()
 
 
 @dataclass(frozen=True)

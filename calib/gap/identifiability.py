@@ -27,6 +27,7 @@ from calib.gap.forward import Forward
 from calib.gap.hypotheses import Hypothesis
 from calib.gap.noise import Noise, noise_conditions
 from calib.inference.mode import hessian_scale, prior_widths
+from calib.inference.problem import Problem
 from calib.inference.random import generator
 from calib.models.base import Array
 
@@ -195,11 +196,17 @@ class NextMeasurement:
         Canonical columns.
     gain_nats : float
         Expected log Bayes factor in favour of whichever is true, averaged over the two.
+    output : str
+        The one that tells most there.
+    expected : pair of pairs of float
+        Mean and sd of one reading of it under the first and the second hypothesis, in its unit.
     """
 
     separates: tuple[str, str]
     conditions: Mapping[str, float]
     gain_nats: float
+    output: str
+    expected: tuple[tuple[float, float], tuple[float, float]]
 
 
 def next_measurements(
@@ -219,11 +226,29 @@ def next_measurements(
     moments = {name: _moments(data, fit, view, seed) for name, fit in in_play.items()}
     found = []
     for a, b in combinations(in_play, 2):
-        gain = _gain(moments[a], moments[b])
+        gains = {o.name: _gain(moments[a][o.name], moments[b][o.name]) for o in data.outputs}
+        gain = np.sum([*gains.values()], axis=0)
         best = int(np.nanargmax(np.where(np.isfinite(gain), gain, -np.inf)))
         conditions = {name: float(values[best]) for name, values in candidates.items()}
-        found.append(NextMeasurement((a, b), conditions, float(gain[best])))
+        telling = max(data.outputs, key=lambda o: gains[o.name][best])
+        of_first, of_second = (
+            _reading(telling.problem, moments[h][telling.name], best) for h in (a, b)
+        )
+        found.append(
+            NextMeasurement(
+                (a, b), conditions, float(gain[best]), telling.name, (of_first, of_second)
+            )
+        )
     return tuple(found)
+
+
+def _reading(problem: Problem, moments: tuple[Array, Array], i: int) -> tuple[float, float]:
+    """Mean and sd of a reading in the output's unit, from those of responses (n,)."""
+    mean, sd = float(moments[0][i]), float(np.sqrt(moments[1][i]))
+    if problem.bound.model.response != "log":
+        return mean, sd
+    middle = float(problem.bound.from_response(np.array([mean]))[0])
+    return middle, middle * sd
 
 
 def _candidates(data: Campaigns, rng: np.random.Generator) -> dict[str, Array]:
@@ -265,11 +290,8 @@ def _moments(data: Campaigns, fit: Fit, view: View, seed: int) -> dict[str, tupl
     return found
 
 
-def _gain(a: dict[str, tuple[Array, Array]], b: dict[str, tuple[Array, Array]]) -> Array:
+def _gain(a: tuple[Array, Array], b: tuple[Array, Array]) -> Array:
     """Half the symmetric Kullback-Leibler divergence of two normal predictions, (n,)."""
-    total: Array = np.zeros(400)
-    for name, (mean_a, var_a) in a.items():
-        mean_b, var_b = b[name]
-        squared = np.square(mean_a - mean_b)
-        total = total + 0.25 * ((var_a + squared) / var_b + (var_b + squared) / var_a - 2.0)
-    return total
+    (mean_a, var_a), (mean_b, var_b) = a, b
+    squared = np.square(mean_a - mean_b)
+    return np.asarray(0.25 * ((var_a + squared) / var_b + (var_b + squared) / var_a - 2.0))

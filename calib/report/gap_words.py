@@ -36,6 +36,7 @@ from calib.report.labels import (
     percent,
     percent_range,
     short,
+    units_of,
 )
 from calib.report.numbers import format_at, format_value, last_place
 from calib.report.page.template import template
@@ -373,7 +374,7 @@ class Words:
         d = self.d
         if d.verdict == "none":
             others = self.n.probable(d.explanations[1:4])
-            yield "Which", self("which")
+            yield "Hypotheses", self("which")
             if d.put_in:
                 yield "Known beforehand", self("known")
             if d.shift_if_same_soil is not None:
@@ -387,12 +388,12 @@ class Words:
             ("Causes", "causes", d.causes),
             ("Known beforehand", "known", d.put_in),
             ("Same soil", "same_soil", d.shift_if_same_soil is not None),
-            ("Which", "which", True),
+            ("Hypotheses", "which", True),
             ("Not tested", "untested", d.untested),
             ("Assumed", "assumed", d.assumed),
-            ("How large", "how_large", sized),
+            ("Size", "how_large", sized),
             ("Where", "where", True),
-            ("How far", "how_far", True),
+            ("Correction", "how_far", True),
         ):
             if there:
                 yield label, self(macro)
@@ -409,8 +410,9 @@ class Words:
 
     def verdict(self) -> GapVerdict:
         """Return the card."""
-        facts = [(label, upper_first(text)) for label, text in self.facts()]
-        headline = upper_first(self("headline"))
+        with units_of(self.d.headers):
+            facts = [(label, upper_first(text)) for label, text in self.facts()]
+            headline = upper_first(self("headline"))
         return GapVerdict(self.tone, self.rule, self("state"), headline, facts)
 
     def terminal(self) -> str:

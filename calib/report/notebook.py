@@ -190,7 +190,7 @@ def _(found: Comparison) -> str:
 def _(found: Diagnosis) -> str:
     said = Words(gap_document(found)).verdict()
     facts = dict(said.facts)
-    lines = [f"{label}: {facts[label]}" for label in ("How large", "Next") if label in facts]
+    lines = [f"{label}: {facts[label]}" for label in ("Size", "Next") if label in facts]
     return _page(said.headline, lines, found)
 
 

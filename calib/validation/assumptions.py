@@ -47,7 +47,11 @@ def remarks_of(calibration: Calibration) -> tuple[Remark, ...]:
     return (
         *(remark("outlying", note=note) for note in outlying_notes(problem, t)),
         *file_remarks(problem, float(problem.theta(t[None])[0, -1])),
-        *((remark("unit_first"),) if any(column_notes(problem.table)) else _surprising(calibration)),
+        *(
+            (remark("unit_first"),)
+            if any(column_notes(problem.table))
+            else _surprising(calibration)
+        ),
         *(
             remark("pressed", name=n, bound=plain_number(b), beyond=_beyond(calibration, n))
             for n, b in _bounds_pressed(calibration).items()

@@ -233,7 +233,9 @@ def test_conditions_that_neither_hypothesis_depends_on_are_not_asked_for(
         "slip_ratio": 0.651, "normal_load_kn": 5.0, "inflation_pressure_psi": 42.0,
         "average_ground_pressure_kpa": 178.0, "speed_m_s": 2.0, "run_order": 26.0,
     }  # fmt: skip
-    one = NextMeasurement(("force_offset", other), conditions, 1.0)
+    one = NextMeasurement(
+        ("force_offset", other), conditions, 1.0, "drawbar_pull", ((1.0, 0.1), (1.2, 0.1))
+    )
     (m,) = gap_document(replace(found, next_measurements=(one,))).next_measurements
     assert (m.matters, m.last) == (("slip_ratio", "inflation_pressure_psi", *matters), last)
 

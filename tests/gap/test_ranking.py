@@ -613,6 +613,10 @@ def test_two_in_play_are_told_apart_where_their_gain_is_largest():
     (found,) = next_measurements(data, fits, 1)
     assert found.separates == ("one", "other")
     assert np.isclose(found.gain_nats, 0.5 * (0.3 / SIGMA["drawbar_pull"]) ** 2)
+    assert found.output == "drawbar_pull"
+    (one, sd), (other, _) = found.expected
+    assert np.isclose(other - one, 0.3)
+    assert np.isclose(sd, SIGMA["drawbar_pull"])
 
 
 def test_too_few_draws_of_an_explanation_in_play_are_said_first():

@@ -422,7 +422,7 @@ def how_far_plate(d: GapDocument, say: Words) -> Plate:
     titles = "Data against prediction", "Error at the field rows", f"Expected at {where}"
     style.set_titles(axes[:1], titles)
     style.legend_below(fig, handles, 4)
-    return Plate(fig, "how_far", say("caption_how_far"), "How far: before and after")
+    return Plate(fig, "how_far", say("caption_how_far"), "Error before and after the correction")
 
 
 _BEFORE: Mapping[str, Any] = {"marker": "s", "ls": "none", "mfc": "none", "mec": VERMILION,
