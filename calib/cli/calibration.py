@@ -154,7 +154,7 @@ def report(
 def fit(
     ctx: typer.Context,
     file: Annotated[Path, typer.Argument(help="CSV whose column names carry units.")],
-    model: Annotated[str, typer.Option(help="See `calib models`.")],
+    model: opt.ModelOption,
     out: Annotated[Path, typer.Option("--out", "-o", help="Run folder to write.")] = Path(
         "calib-run"
     ),

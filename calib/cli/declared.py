@@ -16,8 +16,6 @@ from calib.errors import CalibError
 if TYPE_CHECKING:
     from calib.report.labels import Facts
 
-_OneModel = Annotated[str, typer.Argument(help="See `calib models`.")]
-
 
 def data(
     name: Annotated[str, typer.Argument(help="he2019 or he2019-gaps")],
@@ -53,7 +51,7 @@ def data(
 
 
 def template(
-    model: _OneModel,
+    model: opt.OneModel,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="CSV to write; printed if none.")
     ] = None,
@@ -72,7 +70,7 @@ def template(
 
 
 def priors(
-    model: _OneModel,
+    model: opt.OneModel,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="TOML to write; printed if none.")
     ] = None,
@@ -106,11 +104,20 @@ def _unwritable(what: str, where: Path, error: OSError) -> CalibError:
     return CalibError(wrong, where=str(where), hint="choose another --out")
 
 
-_Name = Annotated[str | None, typer.Argument(help="One of them: all that is declared of it.")]
+_ABOUT = "One of them: all that is declared of it."
+_AModel = Annotated[
+    str | None, typer.Argument(help=_ABOUT, autocompletion=opt.completing("models"))
+]
+_AnEffect = Annotated[
+    str | None, typer.Argument(help=_ABOUT, autocompletion=opt.completing("effects"))
+]
+_AQuantity = Annotated[
+    str | None, typer.Argument(help=_ABOUT, autocompletion=opt.completing("quantities"))
+]
 
 
 def models(
-    name: _Name = None,
+    name: _AModel = None,
     plugins: opt.Models = None,
     simulator: opt.Simulators = None,
     json: opt.Json = False,
@@ -130,7 +137,7 @@ def models(
 
 
 def effects(
-    name: _Name = None,
+    name: _AnEffect = None,
     effects: opt.EffectsFile = None,
     plugins: opt.Models = None,
     json: opt.Json = False,
@@ -155,7 +162,7 @@ def effects(
     finish(0, {"effects": found})
 
 
-def quantities(name: _Name = None, plugins: opt.Models = None, json: opt.Json = False) -> None:
+def quantities(name: _AQuantity = None, plugins: opt.Models = None, json: opt.Json = False) -> None:
     """List the quantities that a column may hold; of one also its units and who uses it."""
     from calib.data.quantities import QUANTITIES
     from calib.data.table import parse_header

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TextIO
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TextIO
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -27,6 +27,28 @@ if TYPE_CHECKING:
 
 type Tell = Callable[[str, int, int], None]
 
+
+def completing(kind: Literal["models", "effects", "quantities"]) -> Callable[[str], list[str]]:
+    """Return what completes the name of a declaration on the Tab key."""
+
+    def complete(incomplete: str) -> list[str]:
+        from calib.data.quantities import QUANTITIES
+        from calib.gap.effects import EFFECTS
+        from calib.models import MODELS
+
+        stems = [q.stem for q in QUANTITIES.values()]
+        names = {"models": [*MODELS], "effects": [*EFFECTS], "quantities": stems}[kind]
+        return [name for name in names if name.startswith(incomplete)]
+
+    return complete
+
+
+OneModel = Annotated[
+    str, typer.Argument(help="See `calib models`.", autocompletion=completing("models"))
+]
+ModelOption = Annotated[
+    str, typer.Option("--model", help="See `calib models`.", autocompletion=completing("models"))
+]
 Seed = Annotated[int, typer.Option(help="Same seed, same numbers.", min=0)]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an earlier result.")]
 HoldOutOption = Annotated[

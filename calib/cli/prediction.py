@@ -156,7 +156,8 @@ def predict(
         list[str] | None,
         typer.Option(
             help="Cause of a diagnosis that no longer acts, as of an "
-            "instrument that was mended; repeatable."
+            "instrument that was mended; repeatable.",
+            autocompletion=opt.completing("effects"),
         ),
     ] = None,
     overwrite: opt.Overwrite = False,

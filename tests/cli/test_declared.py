@@ -6,6 +6,7 @@ import json
 
 import pytest
 
+from calib.cli.app import app
 from calib.data.quantities import QUANTITIES
 from calib.gap.effects import EFFECTS
 from calib.models import MODELS
@@ -64,3 +65,21 @@ def test_what_there_is_not_is_refused_with_what_there_is(calib: Calib, what: str
     assert refused.code == 2
     assert "there is no" in refused.err
     assert "expected: " in refused.err
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        ("fit --model magic", ["magic_formula", "magic_formula_pressure"]),
+        ("effects slip_z", ["slip_zero_shift"]),
+        ("quantities inflation", ["inflation_pressure"]),
+        ("predict --without force", ["force_offset"]),
+    ],
+)
+def test_the_tab_key_completes_names(monkeypatch, capfd, words: str, found: list[str]) -> None:
+    monkeypatch.setenv("_CALIB_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", f"calib {words}")
+    monkeypatch.setenv("COMP_CWORD", str(len(words.split())))
+    with pytest.raises(SystemExit):
+        app(prog_name="calib")
+    assert capfd.readouterr().out.split() == found
