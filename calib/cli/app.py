@@ -125,15 +125,15 @@ def _version(wanted: bool) -> None:
 def start(
     ctx: typer.Context,
     version: Annotated[
-        bool, typer.Option("--version", help="Say which, and stop.", callback=_version,
+        bool, typer.Option("--version", help="Print the version and exit.", callback=_version,
                            is_eager=True)
     ] = False,
     verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="Say on the error output with what versions, "
-                           "what was read and how long it took; where an error came from.")
+        bool, typer.Option("--verbose", "-v", help="Log versions, files read and times to "
+                           "standard error, and show where an error came from.")
     ] = False,
     quiet: Annotated[
-        bool, typer.Option("--quiet", "-q", help="Say nothing but warnings and errors.")
+        bool, typer.Option("--quiet", "-q", help="Print only warnings and errors.")
     ] = False,
 ) -> None:  # fmt: skip
     """Probabilistic calibration of tyre-soil models."""

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 def report(
     ctx: typer.Context,
     files: Annotated[
-        list[Path] | None, typer.Argument(help="Your CSV files; the embedded data if none.")
+        list[Path] | None, typer.Argument(help="Your CSV files; without any, the embedded data.")
     ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")] = Path(
         "calib-report"
@@ -32,26 +32,27 @@ def report(
     hold_out: opt.HoldOutOption = None,
     model: Annotated[
         list[str] | None,
-        typer.Option(help="Model for its output, instead of the suggested one; repeatable."),
+        typer.Option(help="Model to use instead of the suggested one; repeatable."),
     ] = None,
     priors: opt.PriorFiles = None,
     only: Annotated[
-        list[str] | None, typer.Option(help="Output to report, e.g. drawbar_pull; repeatable.")
+        list[str] | None,
+        typer.Option(help="Report this output only, e.g. drawbar_pull; repeatable."),
     ] = None,
     compare: Annotated[
         list[str] | None,
-        typer.Option(help="Model to compare with others on the same rows; two or more times."),
+        typer.Option(help="Also compare these models on the same rows; give two or more."),
     ] = None,
     overwrite: opt.Overwrite = False,
     dry_run: opt.DryRun = False,
-    pdf: Annotated[bool, typer.Option("--pdf", help="Figures also as PDF, for print.")] = False,
+    pdf: Annotated[bool, typer.Option("--pdf", help="Also write figures as PDF.")] = False,
     max_steps: opt.MaxSteps = 25_600,
     posteriors: Annotated[
         bool, typer.Option(help="Keep the posteriors (several megabytes of netCDF) in the folder.")
     ] = True,
     views: Annotated[
         bool,
-        typer.Option(help="Write page, figures and tables beside the numbers."),
+        typer.Option(help="Write page, figures and tables as well as the numbers."),
     ] = True,
     workers: opt.Workers = opt.CORES,
     plugins: opt.Models = None,
@@ -247,7 +248,9 @@ def fit(
 
 def compare(
     ctx: typer.Context,
-    what: Annotated[list[str], typer.Argument(help="Models, then the CSV: A B my.csv.")],
+    what: Annotated[
+        list[str], typer.Argument(help="Two or more models, then the CSV: A B my.csv.")
+    ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")] = Path(
         "calib-comparison"
     ),
@@ -262,7 +265,7 @@ def compare(
     simulator: opt.Simulators = None,
     json: opt.Json = False,
 ) -> None:
-    """Say which of several models the same data prefer, and which they cannot distinguish."""
+    """Compare models on the same data: which they prefer, and which they cannot distinguish."""
     from functools import partial
 
     from calib.batch.folders import claimed, drop, fresh_folder, keep

@@ -21,21 +21,21 @@ def _tell_failed(failed: Mapping[str, str]) -> None:
 def campaign(
     plan: Annotated[Path, typer.Argument(help="TOML file with the tasks: docs/formats/inputs.md.")],
     out: Annotated[
-        Path, typer.Option("--out", "-o", help="Folder of results; resumed if it is there.")
+        Path, typer.Option("--out", "-o", help="Folder for the results; a run there is resumed.")
     ] = Path("calib-campaign"),
     workers: opt.Workers = 2,
     scheduler: opt.Scheduler = None,
     only_list: Annotated[
-        bool, typer.Option("--list", help="Check the plan, list its tasks and stop.")
+        bool, typer.Option("--list", help="Check the plan, list its tasks and exit.")
     ] = False,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Do again what was made from other inputs.")
+        bool, typer.Option("--overwrite", help="Redo results made from other inputs.")
     ] = False,
     plugins: opt.Models = None,
     simulator: opt.Simulators = None,
     json: opt.Json = False,
 ) -> None:
-    """Run many fits, diagnoses, challenge cases or SBC replicates as tasks; run again to resume."""
+    """Run many fits, diagnoses, challenge cases or SBC replicates; run again to resume."""
     from calib.batch.campaign import read_plan, run_campaign
     from calib.data.reader import SEEN
 
@@ -66,14 +66,15 @@ def sbc(
         Path, typer.Option("--out", "-o", help="Folder to write; a run there is resumed.")
     ],
     model: Annotated[
-        list[str] | None, typer.Option(help="Model to test; all but slow ones if none; repeatable.")
+        list[str] | None,
+        typer.Option(help="Model to test; by default all but slow ones; repeatable."),
     ] = None,
-    simulations: Annotated[int, typer.Option(help="Campaigns per model.", min=10)] = 300,
+    simulations: Annotated[int, typer.Option(help="Simulated campaigns per model.", min=10)] = 300,
     seed: opt.Seed = 2019,
     priors: opt.PriorFiles = None,
     data: Annotated[
         Path | None,
-        typer.Option(help="CSV at whose conditions to simulate, not those of the example."),
+        typer.Option(help="CSV with the conditions to simulate, instead of the example's."),
     ] = None,
     workers: opt.Workers = 2,
     scheduler: opt.Scheduler = None,
@@ -81,7 +82,7 @@ def sbc(
     simulator: opt.Simulators = None,
     json: opt.Json = False,
 ) -> None:
-    """Prove posteriors and bands calibrated on simulated data whose truth is known."""
+    """Test posteriors and bands on simulated data whose truth is known."""
     from dataclasses import asdict
 
     from calib.models import MODELS
@@ -110,7 +111,7 @@ def sbc(
 
 
 _Cases = Annotated[Path, typer.Argument(help="Folder with cases.")]
-_Key = Annotated[Path, typer.Option(help="Their sealed answers.")]
+_Key = Annotated[Path, typer.Option(help="File with the sealed answers.")]
 
 challenge = typer.Typer(
     cls=opt.Group, no_args_is_help=True, help="The blind test of the diagnosis."
@@ -125,7 +126,7 @@ def make(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the cases.")],
     key: Annotated[Path, typer.Option(help="File for the sealed answers, outside it.")],
     seed: opt.Seed,
-    cases: Annotated[int, typer.Option(help="How many.", min=1)] = 300,
+    cases: Annotated[int, typer.Option(help="Number of cases.", min=1)] = 300,
     tier: Annotated[
         Literal["both", "easy", "hard", "large"],
         typer.Option(help="Difficulty; large: gaps of 5 to 30 noise sds, up to three causes."),
@@ -151,7 +152,7 @@ def make(
 def run(
     folder: _Cases,
     out: Annotated[
-        Path, typer.Option("--out", "-o", help="Folder for the diagnoses; resumed if it is there.")
+        Path, typer.Option("--out", "-o", help="Folder for the diagnoses; a run there is resumed.")
     ],
     seed: opt.Seed = 1,
     workers: opt.Workers = 2,
@@ -189,7 +190,7 @@ def well_specified(
     scheduler: opt.Scheduler = None,
     json: opt.Json = False,
 ) -> None:
-    """Write the same designs again, with effects that act exactly as the diagnosis believes."""
+    """Write the same designs again, with effects of exactly the forms that the diagnosis has."""
     with from_the_bench("calib challenge well-specified"):
         from challenge.redraw import redraw
     from functools import partial
@@ -218,7 +219,8 @@ def score(
     results: Annotated[Path, typer.Option(help="Folder with the diagnoses.")],
     key: _Key,
     outputs: Annotated[
-        str, typer.Option(help="Only cases that measure these, e.g. drawbar_pull,rut_depth.")
+        str,
+        typer.Option(help="Only cases that measure these outputs, e.g. drawbar_pull,rut_depth."),
     ] = "",
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for the table and figures.")

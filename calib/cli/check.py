@@ -33,7 +33,7 @@ def check(
     ],
     quick: _Quick = False,
     every: Annotated[
-        bool, typer.Option("--all", help="List every number, not only what is not the same.")
+        bool, typer.Option("--all", help="List every number, not only those that differ.")
     ] = False,
     effects: opt.EffectsFile = None,
     workers: opt.Workers = opt.CORES,

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 def data(
     name: Annotated[str, typer.Argument(help="he2019 or he2019-gaps")],
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder to write; its name if none.")
+        Path | None,
+        typer.Option("--out", "-o", help="Folder to write; by default named after the data."),
     ] = None,
     overwrite: opt.Overwrite = False,
 ) -> None:
@@ -53,12 +54,12 @@ def data(
 def template(
     model: opt.OneModel,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="CSV to write; printed if none.")
+        Path | None, typer.Option("--out", "-o", help="CSV to write; by default printed.")
     ] = None,
     plugins: opt.Models = None,
     simulator: opt.Simulators = None,
 ) -> None:
-    """Write an example CSV of a model to fill in."""
+    """Write an example CSV for a model, to fill in."""
     from calib.models import get_model, template_csv
 
     text = template_csv(get_model(model).name)
@@ -72,12 +73,12 @@ def template(
 def priors(
     model: opt.OneModel,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="TOML to write; printed if none.")
+        Path | None, typer.Option("--out", "-o", help="TOML to write; by default printed.")
     ] = None,
     plugins: opt.Models = None,
     simulator: opt.Simulators = None,
 ) -> None:
-    """Write the shipped priors of a model, to copy and edit."""
+    """Write a model's shipped priors, to edit."""
     from calib.inference.prior_files import default_priors
     from calib.models import get_model
 
@@ -104,7 +105,7 @@ def _unwritable(what: str, where: Path, error: OSError) -> CalibError:
     return CalibError(wrong, where=str(where), hint="choose another --out")
 
 
-_ABOUT = "One of them: all that is declared of it."
+_ABOUT = "Show everything about this one."
 _AModel = Annotated[
     str | None, typer.Argument(help=_ABOUT, autocompletion=opt.completing("models"))
 ]
@@ -122,7 +123,7 @@ def models(
     simulator: opt.Simulators = None,
     json: opt.Json = False,
 ) -> None:
-    """List the models with their equations and columns; of one also limits and priors."""
+    """List the models, or show one: equation, columns, limits, priors."""
     from calib.models import MODELS, get_model
     from calib.report.labels import model_facts
 
@@ -142,7 +143,7 @@ def effects(
     plugins: opt.Models = None,
     json: opt.Json = False,
 ) -> None:
-    """List the effects that a diagnosis knows; of one also equation, what it needs, and priors."""
+    """List the effects that a diagnosis considers, or show one: equation, needs, priors."""
     from calib.gap.effects import EFFECTS
     from calib.gap.effects.user import load_effects
     from calib.report.labels import declared, effect_facts, role_columns
@@ -163,7 +164,7 @@ def effects(
 
 
 def quantities(name: _AQuantity = None, plugins: opt.Models = None, json: opt.Json = False) -> None:
-    """List the quantities that a column may hold; of one also its units and who uses it."""
+    """List the quantities that a column may hold, or show one: its units and uses."""
     from calib.data.quantities import QUANTITIES
     from calib.data.table import parse_header
     from calib.report.labels import declared, quantity_facts

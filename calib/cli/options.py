@@ -49,21 +49,26 @@ OneModel = Annotated[
 ModelOption = Annotated[
     str, typer.Option("--model", help="See `calib models`.", autocompletion=completing("models"))
 ]
-Seed = Annotated[int, typer.Option(help="Same seed, same numbers.", min=0)]
+Seed = Annotated[
+    int,
+    typer.Option(help="Seed of the random numbers: the same seed gives the same result.", min=0),
+]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an earlier result.")]
 HoldOutOption = Annotated[
     str | None,
     typer.Option("--hold-out", help="Rows kept for validation, e.g. inflation_pressure_psi=30."),
 ]
-MaxSteps = Annotated[int, typer.Option(help="Where extending the chains stops.", min=100)]
+MaxSteps = Annotated[
+    int, typer.Option(help="Stop extending the chains after so many steps.", min=100)
+]
 DryRun = Annotated[
     bool,
-    typer.Option("--dry-run", help="Check the input, say what would be done, and stop."),
+    typer.Option("--dry-run", help="Check the input, print what would be done, and exit."),
 ]
 PriorFiles = Annotated[list[Path] | None, typer.Option(help="Prior file of a model; repeatable.")]
 EffectsFile = Annotated[
     Path | None,
-    typer.Option("--effects", help="Python file with effects of your own, for this alone."),
+    typer.Option("--effects", help="Python file with effects of your own, for this command only."),
 ]
 
 
@@ -105,7 +110,7 @@ CORES = min(2, os.cpu_count() or 1)  # more than two processes bring little
 Workers = Annotated[int, typer.Option(help="Processes on this machine.", min=1, max=1024)]
 Scheduler = Annotated[
     str | None,
-    typer.Option(help="A Dask scheduler instead of --workers, e.g. tcp://host:8786."),
+    typer.Option(help="Dask scheduler to use instead of --workers, e.g. tcp://host:8786."),
 ]
 
 
@@ -131,7 +136,7 @@ Simulators = Annotated[
     list[Path] | None,
     typer.Option(
         "--simulator",
-        help="TOML file of a simulator of your own, whose command is run; repeatable.",
+        help="TOML file of a simulator of your own; its command is run; repeatable.",
         callback=_load,
     ),
 ]
@@ -172,7 +177,7 @@ def finish(code: int, found: Mapping[str, Any] | Path, **more: Any) -> None:
 
 
 def planned(problems: Iterable[Problem], held: Mapping[str, int], out: Path) -> None:
-    """Say what a command would calibrate, by model the rows held out, and where it would write."""
+    """Print what a command would calibrate, the rows held out of each, and where it would write."""
     found = {}
     for problem in problems:
         model, table = problem.bound.model.name, problem.table

@@ -26,7 +26,7 @@ def diagnose(
     case: Annotated[
         Path | None,
         typer.Argument(
-            help="Folder with a case.toml; its table context takes what is suspected or excluded."
+            help="Folder with a case.toml; its table [context] holds what you suspect or rule out."
         ),
     ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")] = Path(
@@ -43,7 +43,7 @@ def diagnose(
     simulator: opt.Simulators = None,
     json: opt.Json = False,
 ) -> None:
-    """Find where a calibrated model misses, which effect it lacks, how far adding it gains."""
+    """Find where a calibrated model misses, which effect it lacks, and how far adding it helps."""
     from functools import partial
 
     from calib.batch.folders import claimed, fresh_folder, keep
@@ -149,14 +149,14 @@ def predict(
     ],
     at: Annotated[Path, typer.Option(help="CSV with the conditions.")],
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="CSV to write; printed if none.")
+        Path | None, typer.Option("--out", "-o", help="CSV to write; by default printed.")
     ] = None,
     effects: opt.EffectsFile = None,
     without: Annotated[
         list[str] | None,
         typer.Option(
-            help="Cause of a diagnosis that no longer acts, as of an "
-            "instrument that was mended; repeatable.",
+            help="Cause of a diagnosis that no longer acts, such as the "
+            "fault of a repaired instrument; repeatable.",
             autocompletion=opt.completing("effects"),
         ),
     ] = None,
@@ -165,7 +165,7 @@ def predict(
     simulator: opt.Simulators = None,
     json: opt.Json = False,
 ) -> None:
-    """Predict at new conditions: with 50, 90 and 95 % bands; a diagnosis with 90 % bands."""
+    """Predict at new conditions, with 50, 90 and 95 % bands (a diagnosis: 90 %)."""
     from calib.batch.folders import check_room
 
     if out is not None:
