@@ -7,10 +7,12 @@ from io import BytesIO
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 
-from calib.report.page.template import template
-from tests.browser import AXE, PHONE, Browser, faults
+from calib.report.figures.style import png_bytes
+from calib.report.page.template import data_uri, template
+from tests.browser import AXE, LAPTOP, PHONE, Browser, faults
 
 BODY = """
 <h1>Test</h1>
@@ -128,6 +130,19 @@ def test_a_shadow_says_that_there_is_more_on_the_right(
     assert shaded() == (False, True)
     browser.run("document.querySelector('.scroll').scrollLeft = 9999")
     assert shaded() == (True, False)
+
+
+@pytest.mark.parametrize("width", [700, 1000, LAPTOP])
+def test_what_is_said_of_points_lies_over_the_picture(
+    browser: Browser, tmp_path: Path, width: int
+) -> None:
+    shown = {"uri": data_uri(png_bytes(Figure(figsize=(8, 3)))), "size": (2400, 900)}
+    made = template("macros.html.j2").module.frame(
+        {**shown, "narrow": "", "points": [(0, 0, "")]}, ""
+    )
+    browser.open(written(tmp_path, f"<figure>{made}</figure>"), width)
+    place = "return document.querySelector('figure {}').getBoundingClientRect().toJSON()"
+    assert browser.run(place.format("img")) == browser.run(place.format("svg"))
 
 
 def test_contents_lead_where_they_say(opened: Browser) -> None:
