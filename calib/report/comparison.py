@@ -41,10 +41,11 @@ from calib.inference.sampler import SamplerSettings
 from calib.models import get_model
 from calib.models.base import Array
 from calib.report.figures import style
-from calib.report.figures.style import mark, png_bytes
+from calib.report.figures.bands import said_of_rows
+from calib.report.figures.style import Plate, mark, png_bytes, points_in
 from calib.report.labels import Axis, aligned, axis_of, units_of
 from calib.report.numbers import finite, format_number
-from calib.report.page.template import data_uri, equation, template
+from calib.report.page.template import equation, picture, template
 from calib.report.sections import Section, Target, coverage_words
 from calib.report.study import Progress, Study, Task, fitted_rows
 from calib.report.verdict import Verdict, keep_verdict, kept_verdict, verdict
@@ -77,11 +78,15 @@ def comparison_figure(comparison: Comparison) -> Figure:
         handles: dict[str, Any] = {}
         for ax, candidate in zip(axes.flat, candidates, strict=False):
             loo = candidate.loo
-            place = _spread(x.factor * loo.table[column])
-            low, middle, high = y.factor * np.quantile(loo.draws, [0.05, 0.5, 0.95], axis=0)
+            at, values = x.factor * loo.table[column], y.factor * loo.observed
+            place = _spread(at)
+            low, middle, high = expected = y.factor * np.quantile(
+                loo.draws, [0.05, 0.5, 0.95], axis=0
+            )
             bars = ax.vlines(place, low, high, color=style.BLUE, alpha=0.35, linewidth=1.6)
             (dash,) = ax.plot(place, middle, "_", color=style.BLUE)
-            (dots,) = ax.plot(place, y.factor * loo.observed, ".", color=style.BLACK, ms=3.0)
+            (dots,) = ax.plot(place, values, ".", color=style.BLACK, ms=3.0)
+            style.say_of_points(dots, said_of_rows(x, y, at, values, expected, "left out"))
             handles = {"measured": dots, "median without the row": dash}
             handles["90 % interval without the row"] = bars
             if candidate.held is not None:
@@ -100,11 +105,14 @@ def _draw_held(
 ) -> None:
     """Draw the rows that were held out, ringed, and the intervals in which they were expected."""
     x, y = axes
-    place = _spread(x.factor * held.table[column])
-    low, high = y.factor * np.nanquantile(held.draws, [0.05, 0.95], axis=0)
+    at, values = x.factor * held.table[column], y.factor * held.observed
+    place = _spread(at)
+    low, _, high = expected = y.factor * np.nanquantile(held.draws, [0.05, 0.5, 0.95], axis=0)
     ax.vlines(place, low, high, color=style.VERMILION, alpha=0.35, linewidth=1.6)
     look: Any = {"ms": 4.0, "mfc": "white", "mec": style.VERMILION, "mew": 1.0}
-    (handles["held out"],) = ax.plot(place, y.factor * held.observed, "o", **look)
+    (dots,) = ax.plot(place, values, "o", **look)
+    style.say_of_points(dots, said_of_rows(x, y, at, values, expected, "held out"))
+    handles["held out"] = dots
 
 
 def _main_condition(comparison: Comparison) -> str:
@@ -213,7 +221,7 @@ def page(found: Mapping[str, Any], image: bytes) -> str:
         data_label=found.get("data_label", ""),
         head=head,
         rows=body,
-        image=data_uri(image),
+        figure=picture(Plate(None, "bands", "", points=points_in(image)), image, ""),
         models=[get_model(name) for name in found["models"]],
         command=shlex.join(found["command"]),
     )
@@ -354,7 +362,7 @@ def write_comparison(
     with units_of(first.calibration.problem.table.header):
         figure = comparison_figure(comparison)
         mark(figure, first.calibration.problem.table.label)
-        image = png_bytes(figure)
+        image = png_bytes(figure, points=True)
     (folder / "figures").mkdir()
     (folder / FIGURE).write_bytes(image)
     (folder / PAGE).write_text(page(found, image), encoding="utf-8")

@@ -46,7 +46,11 @@ def write(folder: Path) -> None:
         if not path.is_file() or path.read_text(encoding="utf-8") != text:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8")
-    pictures = {f"models/{name}": draw for name, draw in declared_models.pictures().items()}
+    pictures = {
+        f"{kind}/{name}": draw
+        for kind, part in (("models", declared_models), ("effects", declared_effects))
+        for name, draw in part.pictures().items()
+    }
     for name, draw in pictures.items():
         if not (folder / name).is_file():  # its name says what it shows
             (folder / name).write_bytes(draw())

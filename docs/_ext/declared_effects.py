@@ -2,7 +2,20 @@
 
 from __future__ import annotations
 
-from declared_text import code, priors_table, quantity_link, role_links, table, words
+from collections.abc import Callable
+from functools import partial
+
+import effect_pictures
+from declared_text import (
+    code,
+    picture_name,
+    priors_table,
+    quantity_link,
+    role_links,
+    table,
+    with_picture,
+    words,
+)
 
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.hypotheses import read_effect_priors
@@ -32,7 +45,21 @@ def pages() -> dict[str, str]:
     return {name: _page(effect) for name, effect in EFFECTS.items()}
 
 
+def pictures() -> dict[str, Callable[[], bytes]]:
+    """Return how to draw what each effect does, by the name of its file."""
+    return {
+        picture_name(e.name, _page_without_picture(e)): partial(effect_pictures.drawn, e)
+        for e in EFFECTS.values()
+    }
+
+
 def _page(effect: Effect) -> str:
+    what, how = effect_pictures.said(effect)
+    said = f"{words(effect.title)}: {what}"
+    return with_picture(_page_without_picture(effect), effect.name, said, f"{how}\n\n")
+
+
+def _page_without_picture(effect: Effect) -> str:
     text = f"{effect.title[0].upper()}{effect.title[1:]}."
     equation = [f"{part}\n" for part in effect.latex]
     note = "The subscript f marks what holds in the field; names are the parameters below.\n"

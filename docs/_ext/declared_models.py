@@ -4,13 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from hashlib import sha256
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from declared_text import code, priors_table, quantity_link, table, unit, with_symbols, words
+from declared_text import (
+    code,
+    picture_name,
+    priors_table,
+    quantity_link,
+    table,
+    unit,
+    with_picture,
+    with_symbols,
+    words,
+)
 
-from calib.data import read_for_model
+from calib.data import Table, read_for_model
 from calib.data.quantities import QUANTITIES
 from calib.inference.calibration import calibrate
 from calib.inference.problem import build_problem
@@ -43,20 +52,23 @@ def pages() -> dict[str, str]:
 
 def pictures() -> dict[str, Callable[[], bytes]]:
     """Return how to draw each model fitted to its example, by the name of its file."""
-    return {_picture(m): partial(_drawn, m) for m in MODELS.values() if example_of(m)}
+    return {
+        picture_name(m.name, _page_without_picture(m)): partial(_drawn, m)
+        for m in MODELS.values()
+        if example_of(m)
+    }
 
 
-def _picture(model: Model) -> str:
-    """Name the file by all that it shows."""
-    shown = _page_without_picture(model)
-    return f"{model.name}-{sha256(shown.encode()).hexdigest()[:8]}.png"
-
-
-def _drawn(model: Model) -> bytes:
+def example_table(model: Model) -> Table:
+    """Read a model's example."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "example.csv"
         path.write_text(example_of(model), encoding="utf-8")
-        problem = build_problem(model.name, read_for_model(path, (*model.conditions, model.output)))
+        return read_for_model(path, (*model.conditions, model.output))
+
+
+def _drawn(model: Model) -> bytes:
+    problem = build_problem(model.name, example_table(model))
     return png_bytes(calibrate(problem, seed=1).plot())
 
 
@@ -65,7 +77,7 @@ def _page(model: Model) -> str:
     if not example_of(model):
         return page
     said = f"{words(model.title)}, fitted to the example below: readings, median and bands"
-    return page.replace("## Equation", f"![{said}]({_picture(model)})\n\n## Equation", 1)
+    return with_picture(page, model.name, said)
 
 
 def _page_without_picture(model: Model) -> str:
@@ -133,11 +145,8 @@ def _sampled(model: Model) -> str:
     """Say which parameters are sampled, at the reference conditions of the model's example."""
     if "{" not in model.parametrisation:
         return f"{words(model.parametrisation)}\n"
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "example.csv"
-        path.write_text(example_of(model), encoding="utf-8")
-        table = read_for_model(path, (*model.conditions, model.output))
-    said = parametrisation(model.parametrisation, model.bind(table.columns).references)
+    references = model.bind(example_table(model).columns).references
+    said = parametrisation(model.parametrisation, references)
     return f"{words(said)} (The numbers are those of the example below.)\n"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from hashlib import sha256
 
 from calib.inference.priors import Prior
 from calib.report.labels import degrees, role_columns, symbol
@@ -60,6 +61,17 @@ def priors_table(priors: Iterable[Prior]) -> str:
             for p in priors
         ),
     )
+
+
+def picture_name(name: str, page: str) -> str:
+    """Name the file of a picture by all that its page, without it, says."""
+    return f"{name}-{sha256(page.encode()).hexdigest()[:8]}.png"
+
+
+def with_picture(page: str, name: str, said: str, below: str = "") -> str:
+    """Return a page with its picture above the equation, and what is said of it, in words."""
+    shown = f"![{said}]({picture_name(name, page)})\n\n{below}## Equation"
+    return page.replace("## Equation", shown, 1)
 
 
 def toctree(pages: Mapping[str, str]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -64,7 +65,9 @@ def untouched(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Figure]:
     section = replace(plan_comparison(tasks, MODELS, {}), settings=made.SETTINGS)
     found = work_out(tasks, 2019, settings=made.SETTINGS, sections=[section])
     drawn: list[Figure] = []
-    with patch("calib.report.comparison.png_bytes", lambda f: drawn.append(f) or png_bytes(f)):
+    with patch(
+        "calib.report.comparison.png_bytes", lambda f, **how: drawn.append(f) or png_bytes(f, **how)
+    ):
         report = made.write(found, folder / "report")
     return report, drawn[0]
 
@@ -132,6 +135,11 @@ def test_a_comparison_is_shown_in_the_units_of_its_file(
         )
     assert all(cell in text for cell in (*head, *body[0]))
     assert "(mm)" not in text
+    told = re.findall(
+        r"<title>(Ground pressure [\d.]+ psi, (?:left|held) out: measured [\d.]+ inch;)", text
+    )
+    shown = sum(len(m["elpd_rows"]) + m["held_out"]["rows"] for m in found["models"].values())
+    assert len(told) == shown
     axes = untouched[1].axes[0]
     assert "Ground pressure (psi)" in axes.get_xlabel()
     assert "Rut depth (inch)" in axes.get_ylabel()

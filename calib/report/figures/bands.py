@@ -139,11 +139,13 @@ def _panel(ax: Axes, result: _Result, group: Group, reference: Reference) -> dic
         dots = handles[f"{word}, {name}"] = _points(ax, at, values, held=is_held)
         if draws is not None:
             expected = y_axis.scale(np.nanquantile(draws[:, rows], [0.05, 0.5, 0.95], axis=0))
-            style.say_of_points(dots, _said(axis_of(x), y_axis, at, values, expected, name))
+            style.say_of_points(dots, said_of_rows(axis_of(x), y_axis, at, values, expected, name))
     return handles
 
 
-def _said(x: Axis, y: Axis, at: Array, values: Array, expected: Array, name: str) -> Iterator[str]:
+def said_of_rows(
+    x: Axis, y: Axis, at: Array, values: Array, expected: Array, name: str
+) -> Iterator[str]:
     """Say of measured points where they are, and what was expected there (3, n)."""
     for place, value, (low, middle, high) in zip(at, values, expected.T, strict=True):
         yield (
@@ -292,7 +294,7 @@ def _against_cone_index(
     if result.validation is not None and result.validation.method == "leave_one_out":
         expected = np.nanquantile(result.validation.draws, [0.05, 0.5, 0.95], axis=0)
         values = of_density.scale(problem.observed), of_density.scale(expected)
-        said = _said(of_cone, of_density, of_cone.scale(ci), *values, "left out")
+        said = said_of_rows(of_cone, of_density, of_cone.scale(ci), *values, "left out")
         style.say_of_points(points, said)
     x = np.linspace(ci.min(), ci.max(), 60)
     handles: dict[str, Any] = {}

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import base64
+from io import BytesIO
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
+from PIL import Image
 
-from calib.report.page.template import template
-from tests.browser import AXE, PHONE, Browser, faults
+from calib.report.figures.style import png_bytes
+from calib.report.page.template import data_uri, template
+from tests.browser import AXE, LAPTOP, PHONE, Browser, faults
 
 BODY = """
 <h1>Test</h1>
@@ -102,6 +107,42 @@ def test_keys_reach_links_heads_and_what_scrolls(opened: Browser) -> None:
     opened.run("document.querySelector('#rows button').focus()")
     press(Keys.ENTER)
     assert cells(opened, "rows") == "a b c d e"
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_a_shadow_says_that_there_is_more_on_the_right(
+    browser: Browser, tmp_path: Path, dark: bool
+) -> None:
+    wide = '<div class="scroll"><p style="width: 50rem; height: 9rem"></p></div>'
+    browser.open(written(tmp_path, wide), PHONE, dark=dark)
+
+    def shaded() -> tuple[bool, bool]:
+        """Whether the left and the right edge differ from the middle."""
+        box = browser.run("return document.querySelector('.scroll').getBoundingClientRect()")
+        seen = Image.open(BytesIO(base64.b64decode(browser.do("Page.captureScreenshot")["data"])))
+        y = box["top"] + box["height"] / 2
+        left, middle, right = (
+            seen.getpixel((int(x), int(y)))
+            for x in (box["left"] + 1, box["left"] + box["width"] / 2, box["right"] - 2)
+        )
+        return left != middle, right != middle
+
+    assert shaded() == (False, True)
+    browser.run("document.querySelector('.scroll').scrollLeft = 9999")
+    assert shaded() == (True, False)
+
+
+@pytest.mark.parametrize("width", [700, 1000, LAPTOP])
+def test_what_is_said_of_points_lies_over_the_picture(
+    browser: Browser, tmp_path: Path, width: int
+) -> None:
+    shown = {"uri": data_uri(png_bytes(Figure(figsize=(8, 3)))), "size": (2400, 900)}
+    made = template("macros.html.j2").module.frame(
+        {**shown, "narrow": "", "points": [(0, 0, "")]}, ""
+    )
+    browser.open(written(tmp_path, f"<figure>{made}</figure>"), width)
+    place = "return document.querySelector('figure {}').getBoundingClientRect().toJSON()"
+    assert browser.run(place.format("img")) == browser.run(place.format("svg"))
 
 
 def test_contents_lead_where_they_say(opened: Browser) -> None:
