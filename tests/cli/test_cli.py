@@ -286,7 +286,7 @@ def prior_text(old: str, new: str) -> str:
     [
         (
             prior_text("parameters.n0", "parameters.n9"),
-            ["unknown parameter n9", "missing parameter n0", "z_ref, n0, n1, sigma"],
+            ["unknown parameter n9", "did you mean n0?", "z_ref, n0, n1, sigma"],
         ),
         (prior_text("sd = 0.75", "sd = 0.0"), ["parameters.n1", "sd", "greater than 0"]),
         (prior_text("sd = 0.75", "sd = -2"), ["parameters.n1", "sd", "-2", "greater than 0"]),
