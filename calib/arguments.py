@@ -19,7 +19,6 @@ _MADE_BY = {
     "Validation": "calib.validate_held_out(calibration, held_out) returns one",
     "Case": "calib.read_case(folder) returns one",
     "SamplerSettings": "for example calib.SamplerSettings(max_steps=12800)",
-    "Mapping": 'for example {"C": 1.5}',
 }
 
 

@@ -34,6 +34,10 @@ PROBLEM = calib.build_problem("bekker", RUTS)
             "case is of the type DataFrame", "calib.Case or a path",
         ),
         (
+            lambda: calib.diagnose("case", context=["sensor_drift"]),
+            "context is of the type list", "a dictionary",
+        ),
+        (
             lambda: calib.hold_out(RUTS, "inflation_pressure_psi", [30.0]),
             "value is of the type list", "a number",
         ),
