@@ -38,8 +38,16 @@ PROBLEM = calib.build_problem("bekker", RUTS)
             "context is of the type list", "a dictionary",
         ),
         (
-            lambda: calib.hold_out(RUTS, "inflation_pressure_psi", [30.0]),
-            "value is of the type list", "a number",
+            lambda: calib.hold_out(RUTS, "inflation_pressure_psi", "30"),
+            "value = '30'", "a number or a list or an array",
+        ),
+        (
+            lambda: calib.hold_out(RUTS, "inflation_pressure_psi", [30.0, None]),
+            "value = [30.0, None]", "a number, or some in a list",
+        ),
+        (
+            lambda: calib.hold_out(RUTS, "inflation_pressure_psi", []),
+            "value = []", "a number, or some in a list",
         ),
         (lambda: calib.predict(PROBLEM, RUTS), "Problem predicts nothing", "calib.calibrate"),
         (

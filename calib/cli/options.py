@@ -31,7 +31,9 @@ Seed = Annotated[int, typer.Option(help="Same seed, same numbers.", min=0)]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an earlier result.")]
 HoldOutOption = Annotated[
     str | None,
-    typer.Option("--hold-out", help="Rows kept for validation, e.g. inflation_pressure_psi=30."),
+    typer.Option(
+        "--hold-out", help="Rows kept for validation, e.g. inflation_pressure_psi=30 or =18,30."
+    ),
 ]
 MaxSteps = Annotated[int, typer.Option(help="Where extending the chains stops.", min=100)]
 DryRun = Annotated[

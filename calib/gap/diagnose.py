@@ -155,7 +155,8 @@ def diagnose(
     ------
     CalibError
         If the case cannot be diagnosed: an output or a condition is missing, too few rows; if the
-        context names what there is not; or an effect that is not calib's own does not do what an effect must.
+        context names what there is not; or an effect that is not calib's own does not do what an
+        effect must.
 
     Examples
     --------

@@ -78,6 +78,8 @@ def test_hold_out_in_any_unit(header: str, value: float) -> None:
     assert rest.lines.tolist() == [0, 2]
     zero = table_from_arrays({"slip_ratio": [0.0, 0.1, 0.2]})
     assert len(hold_out(zero, "slip_percent", 0)[1]) == 1
+    for several in ([0, 20], (0.0, 20.0), np.array([0.0, 20.0])):
+        assert hold_out(zero, "slip_percent", several)[0]["slip_ratio"].tolist() == [0.1]
 
 
 @pytest.mark.parametrize(
@@ -86,11 +88,12 @@ def test_hold_out_in_any_unit(header: str, value: float) -> None:
         ("inflation_pressure_kpa", 30, ["no row is at 30", "124.106, 206.843, 206.9, 289.58"]),
         ("slip_percent", 10, ["every row is at 10", "nothing would be left to fit"]),
         ("slip_percent", 20, ["no row is at 20", "values present: 10"]),
+        ("inflation_pressure_psi", [18, 31, 33], ["no row is at 31 or 33", "30, 30.0"]),
         ("speed_m_s", 1, ["no column to hold 'speed_m_s' out", "inflation_pressure_psi"]),
         ("inflaton_presure_psi", 18, ["no column", "did you mean inflation_pressure_psi?"]),
     ],
 )
-def test_impossible_hold_outs(header: str, value: float, words: list[str]) -> None:
+def test_impossible_hold_outs(header: str, value: float | list[float], words: list[str]) -> None:
     with pytest.raises(CalibError) as caught:
         hold_out(pressures(), header, value)
     for word in ["lab.csv", *words]:
