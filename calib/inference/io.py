@@ -45,7 +45,7 @@ from calib.inference.priors import prior_references
 from calib.inference.problem import Problem
 from calib.inference.random import generator
 from calib.inference.sampler import Draws, SamplerSettings
-from calib.models import MODELS, BoundModel, get_model
+from calib.models import DECLARE, MODELS, BoundModel, get_model
 from calib.models.base import Array
 from calib.models.simulators.emulator import (
     emulated_model,
@@ -79,8 +79,7 @@ def _known_model(name: str) -> str:
     if name not in MODELS:
         raise CalibError(
             f"model: {name} is not one of {', '.join(MODELS)}", expected="a model known here",
-            hint="pass the file of your own that declares it (--models FILE or --simulator FILE); "
-            "if there is none, restore the folder's",
+            hint=f"{DECLARE}; if there is none, restore the folder's",
         )  # fmt: skip
     return name
 

@@ -116,7 +116,7 @@ def test_an_earlier_run_is_replaced_on_request_only(calib: Calib, run: Path) -> 
     command = ["fit", "my.csv", "--model", "modified_bekker", "--out", run, "--max-steps", 100]
     refused = calib(*command)
     assert refused.code == 2
-    assert "pass --overwrite" in refused.err
+    assert "--overwrite" in refused.err
     command.append("--overwrite")
     Path("run/notes.txt").write_text("mine")
     kept = calib(*command)

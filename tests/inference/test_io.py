@@ -180,7 +180,7 @@ def test_a_run_is_replaced_only_where_that_is_asked_for(
     save_calibration(rut_calibration, folder, overwrite=True)
     assert (folder / "run.json").read_bytes() == before
     (folder / "notes.txt").write_text("mine")
-    with pytest.raises(CalibError, match="calib did not write: notes.txt"):
+    with pytest.raises(CalibError, match=r"calib did not write: notes\.txt"):
         save_calibration(rut_calibration, folder, overwrite=True)
 
 
