@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -62,6 +63,28 @@ def test_an_absent_column_lists_the_present_ones() -> None:
     with pytest.raises(CalibError, match="no column 'speed_m_s'") as caught:
         pressures()["speed_m_s"]
     assert "expected: inflation_pressure_psi, slip_ratio" in str(caught.value)
+    assert "add the column" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [
+        ("slip_percent", "use 'slip_ratio': a table keeps every quantity in one unit"),
+        ("slip_foot", "did you mean slip_ratio?"),
+        ("slip", "did you mean slip_ratio?"),
+    ],
+)
+def test_of_another_name_of_a_column_its_own_is_said(name: str, hint: str) -> None:
+    with pytest.raises(CalibError) as caught:
+        pressures()[name]
+    assert caught.value.hint == hint
+
+
+@pytest.mark.parametrize("convert", [np.asarray, pd.DataFrame])
+def test_a_table_is_not_taken_for_the_names_of_its_columns(convert: type) -> None:
+    with pytest.raises(CalibError, match="not an array") as caught:
+        convert(pressures())
+    assert "table.to_dataframe() has all" in str(caught.value)
 
 
 @pytest.mark.parametrize(
