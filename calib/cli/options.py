@@ -153,6 +153,8 @@ def finish(code: int, found: Mapping[str, Any] | Path, **more: Any) -> None:
 
 def planned(problems: Iterable[Problem], held: Mapping[str, int], out: Path) -> None:
     """Say what a command would calibrate, by model the rows held out, and where it would write."""
+    from calib.validation.assumptions import file_remarks
+
     found = {}
     for problem in problems:
         model, table = problem.bound.model.name, problem.table
@@ -164,10 +166,14 @@ def planned(problems: Iterable[Problem], held: Mapping[str, int], out: Path) -> 
         print(f"  parameters: {', '.join(problem.names)}; priors: {problem.priors.source}")
         for note in problem.notes:
             print(f"  note: {note}")
+        # Whether copied rows are chance depends on the scatter, which only a fit tells.
+        warnings = [remark.text for remark in file_remarks(problem, 0.0)]
+        for text in warnings:
+            print(f"  warning: {text}")
         found[model] = {
             "rows": len(table), "held_out": held.get(model, 0), "columns": columns,
             "not_used": list(table.ignored), "parameters": list(problem.names),
-            "notes": list(problem.notes),
+            "notes": list(problem.notes), "warnings": warnings,
         }  # fmt: skip
     print(f"would write {out}; nothing was computed (--dry-run)")
     finish(0, {"would_write": str(out), "models": found})

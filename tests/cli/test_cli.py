@@ -448,6 +448,18 @@ def test_a_dry_run_checks_the_input_and_computes_nothing(calib: Calib) -> None:
     assert calib("fit", "bad.csv", "--model", "modified_bekker", "--dry-run").code == 2
 
 
+def test_a_dry_run_says_that_pressures_are_as_in_another_unit(calib: Calib) -> None:
+    head, *rows = template_csv("magic_formula_pressure").splitlines()
+    cells = [row.split(",") for row in rows]
+    at = head.split(",").index("inflation_pressure_psi")
+    for row in cells:
+        row[at] = f"{6.894757 * float(row[at]):.0f}"
+    Path("kpa.csv").write_text("\n".join([head, *map(",".join, cells)]) + "\n")
+    ran = calib("fit", "kpa.csv", "--model", "magic_formula_pressure", "--dry-run")
+    assert ran.code == 0
+    assert "all would be inside if the readings are in kPa" in ran.out
+
+
 def test_quiet_leaves_warnings_and_errors(calib: Calib) -> None:
     Path("my.csv").write_text(RUT)
     ran = calib("-q", "fit", "my.csv", "--model", "modified_bekker")
