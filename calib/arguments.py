@@ -12,14 +12,18 @@ from typing import Any
 from calib.errors import CalibError
 
 _WORDS = {"Integral": "a whole number from 0 on", "PathLike": "a path", "str": "text"}
-_WORDS |= {"Mapping": "a dictionary", "Real": "a number"}
+_WORDS |= {
+    "Mapping": "a dictionary",
+    "Real": "a number",
+    "Sequence": "a list",
+    "ndarray": "an array",
+}
 _MADE_BY = {
     "Problem": "calib.build_problem(model, table) returns one",
     "Calibration": "calib.calibrate(problem, seed=1) returns one",
     "Validation": "calib.validate_held_out(calibration, held_out) returns one",
     "Case": "calib.read_case(folder) returns one",
     "SamplerSettings": "for example calib.SamplerSettings(max_steps=12800)",
-    "Mapping": 'for example {"C": 1.5}',
 }
 
 
@@ -51,8 +55,9 @@ def _check(function: str, name: str, value: object, kind: Any) -> None:
     kinds = kind if isinstance(kind, tuple) else (kind,)
     taken = (*kinds, str) if PathLike in kinds else kinds
     negative = isinstance(value, Integral) and int(value) < 0
+    letters = isinstance(value, str) and str not in taken  # a sequence, but no list of values
     if isinstance(value, taken) and not (
-        Integral in kinds and (isinstance(value, bool) or negative)
+        letters or (Integral in kinds and (isinstance(value, bool) or negative))
     ):
         return
     plain = isinstance(value, int | float | str)

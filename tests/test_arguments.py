@@ -34,8 +34,20 @@ PROBLEM = calib.build_problem("bekker", RUTS)
             "case is of the type DataFrame", "calib.Case or a path",
         ),
         (
-            lambda: calib.hold_out(RUTS, "inflation_pressure_psi", [30.0]),
-            "value is of the type list", "a number",
+            lambda: calib.diagnose("case", context=["sensor_drift"]),
+            "context is of the type list", "a dictionary",
+        ),
+        (
+            lambda: calib.hold_out(RUTS, "inflation_pressure_psi", "30"),
+            "value = '30'", "a number or a list or an array",
+        ),
+        (
+            lambda: calib.hold_out(RUTS, "inflation_pressure_psi", [30.0, None]),
+            "value = [30.0, None]", "a number, or some in a list",
+        ),
+        (
+            lambda: calib.hold_out(RUTS, "inflation_pressure_psi", []),
+            "value = []", "a number, or some in a list",
         ),
         (lambda: calib.predict(PROBLEM, RUTS), "Problem predicts nothing", "calib.calibrate"),
         (

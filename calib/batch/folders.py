@@ -38,6 +38,9 @@ _RECORDS: Mapping[str, tuple[str, ...]] = {
 # The disk is full, the quota used up, the file system read-only.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 
+# Said to whom types commands, and to whom calls functions.
+REPLACE = "choose another folder, or replace this one: --overwrite, in Python overwrite=True"
+
 type Write = Callable[[Path], object]
 
 # Folders that commands of this process have written, or what of theirs was rescued.
@@ -118,7 +121,7 @@ def claimed(out: Path, *, overwrite: bool = False) -> Iterator[None]:
         raise CalibError(
             "another process is working on this output folder",
             where=str(out),
-            hint="wait until it ends, stop it, or choose another --out",
+            hint="wait until it ends, stop it, or choose another folder",
         )
     scratch, held = _claims[out.absolute()] = _scratch(out)
     try:
@@ -243,7 +246,7 @@ def _replaceable(out: Path, *, overwrite: bool) -> Path:
         raise CalibError(
             "the output folder is a mount point, which cannot be replaced",
             where=str(out),
-            hint="choose a new folder inside it as --out",
+            hint="choose a new folder inside it",
         )
     return out
 
@@ -383,7 +386,7 @@ def _unwritable(out: Path, why: str) -> CalibError:
     return CalibError(
         f"the output cannot be written ({why})",
         where=str(out),
-        hint="choose another --out, change its permissions, or make room",
+        hint="choose another folder, change its permissions, or make room",
     )
 
 
@@ -414,25 +417,22 @@ def check_folder(out: Path, *, overwrite: bool = False) -> None:
         return CalibError(f"the output folder {why}", where=str(out), hint=hint)
 
     if exists and not out.is_dir():
-        raise refuse("is an existing file", "choose another --out")
+        raise refuse("is an existing file", "choose another folder")
     if exists and out.resolve() == Path.cwd():
         raise refuse(
             "is the current folder, which cannot be replaced",
-            "choose another --out, such as a new folder inside it",
+            "choose another folder, such as a new folder inside it",
         )
     check_room(out, _above(out))
     if not exists or not any(out.iterdir()):
         return
     if not overwrite:
-        raise refuse(
-            "exists and is not empty",
-            "choose another --out, or pass --overwrite to replace it",
-        )
+        raise refuse("exists and is not empty", REPLACE)
     records = [name for name in _RECORDS if (out / name).exists()]
     if not records:
         raise refuse(
             "was not written by calib, so it is not replaced",
-            "choose another --out, or delete the folder yourself",
+            "choose another folder, or delete the folder yourself",
         )
     written = {name for record in records for name in _written(out, record)}
     files = (p.relative_to(out) for p in sorted(out.rglob("*")) if not p.is_dir())
@@ -440,7 +440,7 @@ def check_folder(out: Path, *, overwrite: bool = False) -> None:
     if others:
         raise refuse(
             f"holds files that calib did not write: {', '.join(others[:5])}",
-            "move them elsewhere, or choose another --out",
+            "move them elsewhere, or choose another folder",
         )
 
 

@@ -87,7 +87,7 @@ def pool(workers: int, files: Mapping[Path, Loader] | None = None) -> Iterator[E
         if isinstance(error, BrokenProcessPool):
             raise CalibError(
                 "a process died while it worked: it was killed, or there was no memory left",
-                hint="run it again, with --workers 1 if it happens again",
+                hint="run it again; if it happens again, with one worker (--workers 1)",
             ) from None
         raise
 

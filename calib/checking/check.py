@@ -39,7 +39,7 @@ from calib.checking.tolerances import describe, drawn_in_output
 from calib.data import has_rows, read_table
 from calib.data.files import inside, read_json
 from calib.data.quantities import OUTPUTS
-from calib.errors import CalibError
+from calib.errors import FAULTS, CalibError
 from calib.gap.files import mispredicted, misquoted
 from calib.inference.io import (
     DATA,
@@ -53,7 +53,7 @@ from calib.inference.io import (
     fault_of,
     read_record,
 )
-from calib.inference.prior_files import default_priors
+from calib.inference.prior_files import default_priors, inherited_otherwise
 from calib.inference.problem import Problem, build_problem
 from calib.models import get_model
 from calib.report.comparison import FILE, HELD_OUT, ComparisonRecord
@@ -349,10 +349,15 @@ def _problem(task: Task) -> Problem:
 
 
 def _verify_priors(key: str, entry: TaskRecord, folder: Path, *, same_code: bool) -> Item:
-    """Check that priors which are called the shipped ones are."""
+    """Check that priors which are called the shipped ones are, all of them or what a file left."""
     file, shipped = entry.priors.file, default_priors(entry.model)
     if not entry.priors.shipped:
-        return claim(INPUTS, file, "", f"priors of the user for {key}")
+        changed: list[str] = []
+        with suppress(*FAULTS):  # what cannot be read has another hash
+            changed = inherited_otherwise((folder / file).read_text("utf-8"), entry.model)
+        names = ", ".join(changed)
+        wrong = f"{names}: not as in the {shipped.name} of this version" if names else ""
+        return claim(INPUTS, file, wrong, f"priors of the user for {key}", sure=same_code)
     same = unix_lines((folder / file).read_bytes()) == unix_lines(shipped.read_bytes())
     wrong = "" if same else f"not the {shipped.name} of this version"
     return claim(INPUTS, file, wrong, f"the shipped {shipped.name}", sure=same_code)

@@ -372,6 +372,6 @@ def _effects_of(record: DiagnosisRecord, job: Job) -> dict[str, Any]:
             "the effects are not those that the diagnosis was made with",
             where=str(job.effects or job.folder),
             expected=", ".join(record.effects) or "no effects other than those of calib",
-            hint="give the same file as --effects, or none if none was given",
+            hint="give the same file of effects (--effects), or none if none was given",
         )
     return {**EFFECTS, **own}

@@ -56,7 +56,9 @@ Seed = Annotated[
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an earlier result.")]
 HoldOutOption = Annotated[
     str | None,
-    typer.Option("--hold-out", help="Rows kept for validation, e.g. inflation_pressure_psi=30."),
+    typer.Option(
+        "--hold-out", help="Rows kept for validation, e.g. inflation_pressure_psi=30 or =18,30."
+    ),
 ]
 MaxSteps = Annotated[
     int, typer.Option(help="Stop extending the chains after so many steps.", min=100)
@@ -178,6 +180,8 @@ def finish(code: int, found: Mapping[str, Any] | Path, **more: Any) -> None:
 
 def planned(problems: Iterable[Problem], held: Mapping[str, int], out: Path) -> None:
     """Print what a command would calibrate, the rows held out of each, and where it would write."""
+    from calib.validation.assumptions import file_remarks
+
     found = {}
     for problem in problems:
         model, table = problem.bound.model.name, problem.table
@@ -189,10 +193,14 @@ def planned(problems: Iterable[Problem], held: Mapping[str, int], out: Path) -> 
         print(f"  parameters: {', '.join(problem.names)}; priors: {problem.priors.source}")
         for note in problem.notes:
             print(f"  note: {note}")
+        # Whether copied rows are chance depends on the scatter, which only a fit tells.
+        warnings = [remark.text for remark in file_remarks(problem, 0.0)]
+        for text in warnings:
+            print(f"  warning: {text}")
         found[model] = {
             "rows": len(table), "held_out": held.get(model, 0), "columns": columns,
             "not_used": list(table.ignored), "parameters": list(problem.names),
-            "notes": list(problem.notes),
+            "notes": list(problem.notes), "warnings": warnings,
         }  # fmt: skip
     print(f"would write {out}; nothing was computed (--dry-run)")
     finish(0, {"would_write": str(out), "models": found})

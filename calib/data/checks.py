@@ -370,11 +370,14 @@ def check_varies(table: Table, column: str) -> None:
     )  # fmt: skip
 
 
-@takes(quantity_header=str, value=Real)
+@takes(quantity_header=str, value=(Real, Sequence, np.ndarray))
 def hold_out(
-    table: Tabular, quantity_header: str, value: float, rel_tol: float = 1e-3
+    table: Tabular,
+    quantity_header: str,
+    value: float | Sequence[float] | NDArray[np.float64],
+    rel_tol: float = 1e-3,
 ) -> tuple[Table, Table]:
-    """Set aside the rows at one value of a quantity.
+    """Set aside the rows at one value of a quantity, or at several.
 
     Parameters
     ----------
@@ -382,8 +385,8 @@ def hold_out(
     quantity_header : str
         A column name in any unit, such as ``"inflation_pressure_psi"``; the data may have it in
         another one.
-    value : float
-        The value to hold out, in that unit.
+    value : float or sequence of float
+        The value to hold out, or several of them, in that unit.
     rel_tol : float
         Relative difference up to which a row counts as at that value. 30 psi written as
         207 kPa differs by 7e-4.
@@ -395,7 +398,7 @@ def hold_out(
     Raises
     ------
     CalibError
-        If no row has that value, listing those present, or if every row has it.
+        If no row has such a value, listing those present, or if every row has one.
 
     Examples
     --------
@@ -404,7 +407,16 @@ def hold_out(
     >>> fitted, held_out = calib.hold_out(pulls, "inflation_pressure_psi", 30)
     >>> len(fitted), len(held_out)
     (28, 14)
+    >>> fitted, held_out = calib.hold_out(pulls, "inflation_pressure_psi", [18, 30])
+    >>> len(fitted), len(held_out)
+    (14, 28)
     """
+    wanted = [*value] if isinstance(value, Sequence | np.ndarray) else [value]
+    if not wanted or not all(isinstance(v, Real) for v in wanted):
+        raise CalibError(
+            f"value = {value!r}", where="calib.hold_out", expected="a number, or some in a list",
+            hint="correct value",
+        )  # fmt: skip
     table, column = as_table(table), parse_header(quantity_header)
     if column is None or column.quantity.canonical not in table:
         guess = columns_meant(
@@ -416,24 +428,29 @@ def hold_out(
             hint=" Or ".join([*guess, "name one of these quantities, with a unit"]),
         )  # fmt: skip
     values = table[column.quantity.canonical]
-    wanted = float(column.to_canonical(value))
-    scale = abs(wanted) or float(np.nanmax(np.abs(values)))
-    held = np.abs(values - wanted) <= rel_tol * scale
-    if held.any() and not held.all():
+    largest, absent = float(np.nanmax(np.abs(values))), []
+    held = np.zeros(len(table), dtype=bool)
+    for one in wanted:
+        at = float(column.to_canonical(one))
+        here = np.abs(values - at) <= rel_tol * (abs(at) or largest)
+        held |= here
+        absent += [] if here.any() else [f"{one:g}"]
+    if not absent and not held.all():
         return table.take(~held), table.take(held)
     where = f"{table.source}, column {quantity_header!r}"
-    if held.any():
+    if not absent:
+        plain = " or ".join(f"{v:g}" for v in wanted)
         raise CalibError(
-            f"every row is at {value:g}, so nothing would be left to fit",
+            f"every row is at {plain}, so nothing would be left to fit",
             where=where,
-            expected="a value that only some of the rows have",
+            expected="values that only some of the rows have",
             hint="hold out something else",
         )
     levels = np.unique(values[~np.isnan(values)]) / column.to_canonical(1.0)
     present = list(dict.fromkeys(f"{v:.6g}" for v in levels))
     present[12:] = [f"and {len(present) - 12} more"] * (len(present) > 12)
     raise CalibError(
-        f"no row is at {value:g}",
+        f"no row is at {' or '.join(absent)}",
         where=where,
         expected=f"one of the values present: {', '.join(present)}",
         hint="hold out one of these, or check the unit",

@@ -10,6 +10,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -19,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib.data.files import plain_number
 from calib.data.quantities import QUANTITIES, UNITS, Quantity, convert
-from calib.errors import CalibError
+from calib.errors import CalibError, meant
 from calib.shown import Shown
 
 # A column such as drawbar_pull_sd or slip_angle_deg is about a quantity without being it.
@@ -419,9 +420,26 @@ class Table(Shown):
         if name not in self.columns:
             raise CalibError(
                 f"there is no column {name!r}", where=self.source,
-                expected=", ".join(self.columns), hint="add the column to the data",
+                expected=", ".join(self.columns), hint=self._instead_of(str(name)),
             )  # fmt: skip
         return self.columns[name]
+
+    def _instead_of(self, name: str) -> str:
+        """Say which column may have been meant by a name that is none of a column here."""
+        with suppress(CalibError):  # an unknown unit
+            column = parse_header(name)
+            canonical = "" if column is None else column.quantity.canonical
+            if canonical in self:
+                return f"use {canonical!r}: a table keeps every quantity in one unit"
+        return meant(name, self.columns, "add the column to the data")
+
+    def __array__(self, *_: object, **__: object) -> NDArray[np.float64]:
+        # NumPy and pandas would take the names of the columns for the values.
+        raise CalibError(
+            "a table is not an array", where=self.source,
+            expected="one of its columns, or all as a DataFrame",
+            hint=f"table[{next(iter(self), '')!r}] is a column; table.to_dataframe() has all",
+        )  # fmt: skip
 
     @cached_property
     def _headers(self) -> Mapping[str, Column]:

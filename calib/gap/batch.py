@@ -102,7 +102,7 @@ def check_resumable(cases: Sequence[Path], out: Path, seed: int) -> None:
             f"{len(names)} of the diagnoses that are there {reason}: {listed}",
             where=str(out),
             expected="an empty folder, or earlier diagnoses of the same cases",
-            hint="choose another --out, or delete this folder",
+            hint="choose another folder, or delete this folder",
         )
 
 

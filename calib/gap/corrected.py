@@ -29,6 +29,7 @@ from calib.gap.forward import Forward
 from calib.gap.hypotheses import Hypothesis, effect_priors, with_case_effects
 from calib.gap.mixture import Mixture, Truth
 from calib.gap.noise import Noise
+from calib.inference.prior_files import whole_text
 from calib.inference.priors import Priors
 from calib.models.base import Array
 from calib.shown import Shown
@@ -107,7 +108,8 @@ def save_corrected(corrected: Corrected, folder: Path) -> None:
     lines += ["", "[models]", *(f'{output} = "{model}"' for output, model in case.models.items())]
     lines += ["", "[priors]"] if case.priors else []
     for output, priors in case.priors.items():
-        (inner / f"{output}_priors.toml").write_text(priors.text, encoding="utf-8")
+        text = whole_text(priors, case.models[output])
+        (inner / f"{output}_priors.toml").write_text(text, encoding="utf-8")
         lines.append(f'{output} = "{output}_priors.toml"')
     lines += ["", "[covariates]"] if case.covariates else []
     for name, levels in case.covariates.items():

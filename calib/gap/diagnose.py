@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, fields, replace
 from numbers import Integral
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from calib.batch.environment import one_thread
 from calib.batch.pool import HERE
 from calib.data.quantities import OUTPUTS, columns_of, role_of
 from calib.gap.campaigns import Campaigns, campaigns
-from calib.gap.case import Case, Context, new_values, read_case
+from calib.gap.case import Case, Context, new_values, read_case, read_context
 from calib.gap.constants import FOLD_DRAWS, FOLDS, MIN_FIELD_ROWS, MOST_ROUNDS, NAMED, WORTH_SAYING
 from calib.gap.corrected import (
     Corrected,
@@ -118,11 +119,12 @@ class Diagnosis(Shown):
 type Progress = Callable[[str, int, int], None]
 
 
-@takes(case=(Case, PathLike), seed=Integral, effects=Mapping)
+@takes(case=(Case, PathLike), seed=Integral, effects=Mapping, context=Mapping)
 def diagnose(
     case: Case | str | Path,
     seed: int = 1,
     *,
+    context: Mapping[str, Any] | None = None,
     effects: Mapping[str, Effect] = EFFECTS,
     pool: Executor = HERE,
     progress: Progress = lambda what, done, planned: None,
@@ -135,6 +137,9 @@ def diagnose(
         A case, or the folder of one (`case.toml`, `lab.csv`, `field.csv`).
     seed : int
         Same seed, same numbers.
+    context : mapping, optional
+        What is known beyond the data, as the table ``[context]`` of a ``case.toml`` has it, in the
+        place of the case's own: ``same_soil``, ``suspected``, ``excluded``, ``sizes``.
     effects : mapping of str to Effect, optional
         The effects to consider, by name.
     pool : Executor, optional
@@ -149,17 +154,22 @@ def diagnose(
     Raises
     ------
     CalibError
-        If the case cannot be diagnosed: an output or a condition is missing, too few rows; or
-        an effect that is not calib's own does not do what an effect must.
+        If the case cannot be diagnosed: an output or a condition is missing, too few rows; if the
+        context names what there is not; or an effect that is not calib's own does not do what an
+        effect must.
 
     Examples
     --------
     >>> import calib
     >>> diagnosis = calib.diagnose("cases/nominal_slip")  # doctest: +SKIP
     >>> diagnosis.to_dataframe().head(3)  # doctest: +SKIP
+    >>> known = {"same_soil": True, "suspected": {"lug_thrust": 0.5}, "excluded": ["rate_effect"]}
+    >>> diagnosis = calib.diagnose("cases/nominal_slip", context=known)  # doctest: +SKIP
     """
     if not isinstance(case, Case):
         case = read_case(Path(case))
+    if context is not None:
+        case = replace(case, context=read_context(context, "calib.diagnose"))
     found = diagnose_once(case, seed, effects, progress)
     progress("leaving field rows out", 0, 1)
     found = with_unseen_rows(found, effects, pool)

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from calib.batch.environment import one_thread
+from calib.batch.folders import REPLACE
 from calib.batch.pool import HERE
 from calib.data import Table, table_from_arrays, write_table
 from calib.data.quantities import OUTPUTS
@@ -162,7 +163,7 @@ def write_cases(gaps: Sequence[PaperGap], out: Path, *, overwrite: bool = False)
         raise CalibError(
             f"{', '.join(existing)} exist there already",
             where=str(out),
-            hint="choose another --out, or pass --overwrite",
+            hint=REPLACE,
         )
     for gap, folder in zip(gaps, folders, strict=True):
         folder.mkdir(parents=True, exist_ok=True)

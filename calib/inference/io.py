@@ -32,6 +32,7 @@ from pydantic import (
 
 from calib.arguments import takes
 from calib.batch.environment import Environment, differs_in_lines, sha256
+from calib.batch.folders import check_folder
 from calib.data import Table, read_for_model, write_table
 from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError, in_words
@@ -44,7 +45,7 @@ from calib.inference.priors import prior_references
 from calib.inference.problem import Problem
 from calib.inference.random import generator
 from calib.inference.sampler import Draws, SamplerSettings
-from calib.models import MODELS, BoundModel, get_model
+from calib.models import DECLARE, MODELS, BoundModel, get_model
 from calib.models.base import Array
 from calib.models.simulators.emulator import (
     emulated_model,
@@ -78,8 +79,7 @@ def _known_model(name: str) -> str:
     if name not in MODELS:
         raise CalibError(
             f"model: {name} is not one of {', '.join(MODELS)}", expected="a model known here",
-            hint="pass the file of your own that declares it (--models FILE or --simulator FILE); "
-            "if there is none, restore the folder's",
+            hint=f"{DECLARE}; if there is none, restore the folder's",
         )  # fmt: skip
     return name
 
@@ -392,14 +392,25 @@ def save_calibration(
     calibration: Calibration,
     folder: str | Path,
     *,
+    overwrite: bool = False,
     environment: Environment | None = None,
 ) -> None:
     """Write a run folder.
 
     Parameters
     ----------
+    calibration : Calibration
+    folder : path
+        New, or empty.
+    overwrite : bool
+        Whether to replace a folder that calib has written.
     environment : Environment, optional
         Where it says that it was made: in that of this process by default.
+
+    Raises
+    ------
+    CalibError
+        If the folder is not empty and may not be replaced, or cannot be written.
 
     Examples
     --------
@@ -408,6 +419,9 @@ def save_calibration(
     >>> calib.save_calibration(calibration, Path("run"))  # doctest: +SKIP
     """
     problem, folder = calibration.problem, Path(folder)
+    check_folder(folder, overwrite=overwrite)
+    if overwrite and folder.exists():
+        shutil.rmtree(folder)
     folder.mkdir(parents=True, exist_ok=True)
     save_posterior(calibration, folder / POSTERIOR)
     (folder / PRIORS).write_text(problem.priors.text, encoding="utf-8")

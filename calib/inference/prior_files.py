@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from importlib import resources
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -21,6 +22,7 @@ from calib.errors import CalibError, in_words, meant
 from calib.inference.likelihood import DEFAULT_PRIORS, IID_NORMAL, Along, Family, Noise
 from calib.inference.priors import Prior, Priors
 from calib.models import MODELS
+from calib.models.simulators.declaration import written
 
 # Beyond these, squares and products of numbers leave the range of double precision; no quantity of
 # the field comes near them. An sd of 20 on the logarithm is a factor of 5e8 to either side.
@@ -36,6 +38,9 @@ class _Entry(BaseModel):
     source: str = Field(min_length=1)
     relative_to: str | None = None
     default_reference: _Positive = 1.0
+    inherited: bool = Field(
+        False, description="in copies that calib keeps: the file left this prior to the model's own"
+    )
 
 
 class _Bounded(_Entry):
@@ -106,7 +111,7 @@ class PriorFileContent(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
     model: str
     likelihood: LikelihoodTable = LikelihoodTable()
-    parameters: dict[str, PriorEntry]
+    parameters: dict[str, PriorEntry] = {}
 
 
 NOISE_ENTRIES = TypeAdapter(dict[str, PriorEntry]).validate_python(tomllib.loads(DEFAULT_PRIORS))
@@ -312,11 +317,12 @@ def read_priors(
     Parameters
     ----------
     path : Path or PriorFile
-        TOML file with ``model`` and a table ``parameters.NAME`` for each parameter.
+        TOML file with ``model`` and tables ``parameters.NAME``; what it leaves out is taken from
+        the model's own priors (see `whole_text`).
     model_name : str
         The model it must be for.
     parameters : sequence of str
-        The parameters it must give, in order; of a model the noise scale ``sigma`` last. Those of
+        The parameters it is to give, in order; of a model the noise scale ``sigma`` last. Those of
         the noise that the file chooses are put before it, and have default priors.
     references : mapping of str to float
         Values of the columns that priors may be relative to, as `prior_references` returns them.
@@ -327,8 +333,67 @@ def read_priors(
         If the file is missing, is not TOML, or gives unknown, missing or impossible entries.
     """
     place = path.place if isinstance(path, DeclaredPriors) else ""
-    priors = parse_priors(_text(path), place or str(path), model_name, parameters, references)
+    text = whole_text(path, model_name)
+    priors = parse_priors(text, place or str(path), model_name, parameters, references)
     return replace(priors, source=str(path)) if place else priors
+
+
+def whole_text(path: PriorFile, model_name: str) -> str:
+    """Return the text of a prior file, with the model's own priors of what it leaves out.
+
+    These are marked as inherited. What cannot be completed is returned as it is: parsing it tells
+    what is wrong.
+    """
+    text, own = _text(path), default_priors(model_name)
+    if not own.is_file():
+        return text
+    with suppress(tomllib.TOMLDecodeError):
+        content = _parsed(text)
+        given, others = content.get("parameters", {}), _parsed(read_text(own)).get("parameters")
+        if not (isinstance(given, dict) and isinstance(others, dict)):
+            return text
+        if content.get("model") != model_name:
+            return text
+        if given.keys() - others.keys() - NOISE_ENTRIES.keys():  # misspelt, probably
+            return text
+        tables = [
+            written(name, entry | {"inherited": True})
+            for name, entry in others.items()
+            if name not in given
+        ]
+        whole = "\n".join([text.rstrip("\n") + "\n", *tables])
+        _parsed(whole)  # an inline table of parameters takes no more of them
+        return whole if tables else text
+    return text
+
+
+def _inherited(text: str) -> dict[str, Any]:
+    """Return the entries that a whole text has from the model's own priors, without their mark."""
+    return {
+        name: {key: value for key, value in entry.items() if key != "inherited"}
+        for name, entry in _parsed(text)["parameters"].items()
+        if entry.get("inherited")
+    }
+
+
+def inherited_otherwise(text: str, model_name: str) -> list[str]:
+    """Return the parameters whose priors in a whole text are no longer the model's own."""
+    left = _inherited(text)
+    own = _parsed(read_text(default_priors(model_name)))["parameters"] if left else {}
+    return [name for name, entry in left.items() if own.get(name) != entry]
+
+
+def inheritance_note(priors: Priors, model_name: str) -> str:
+    """Say which priors a file sets and whose the others are; empty if it sets all."""
+    entries, left = _parsed(priors.text)["parameters"], _inherited(priors.text)
+    if not left:
+        return ""
+    own = ", ".join(name for name in entries if name not in left)
+    whose = "shipped ones" if isinstance(default_priors(model_name), Path) else "model's own"
+    file = PurePath(priors.source).name
+    if not own:
+        return f"{file} sets no prior; all are the {whose}"
+    return f"{file} sets the prior of {own}; those of {', '.join(left)} are the {whose}"
 
 
 def _text(path: PriorFile) -> str:
@@ -459,20 +524,20 @@ def _check_names(
     given = content.get("parameters")
     given = given if isinstance(given, Mapping) else {}
     unknown = [name for name in given if name not in (*parameters, *of_noise)]
-    missing = [name for name in parameters if name not in given]
+    left = [name for name in parameters if name not in given]
+    missing = [] if unknown and default_priors(model_name).is_file() else left
     if unknown or missing:
         kinds = (("unknown parameter", unknown), ("missing parameter", missing))
         found = "; ".join(f"{what} {', '.join(names)}" for what, names in kinds if names)
-        meanings = ((name, meant(name, missing, "")) for name in unknown)
+        meanings = ((name, meant(name, left, "")) for name in unknown)
         guesses = "".join(f"{name}: {guess} " for name, guess in meanings if guess)
-        shipped = default_priors(model_name)
-        there = isinstance(shipped, Path) and shipped.is_file()
-        copy = "; copy the shipped file and edit it" if there else ""
         raise CalibError(
             found,
             where=f"{source}, [parameters]",
             expected=", ".join(parameters),
-            hint=f"{guesses}give exactly these parameters{copy}",
+            hint=f"{guesses}give all of these, each as a table [parameters.NAME]"
+            if missing
+            else f"{guesses}correct the name, or take it out",
         )
 
 

@@ -47,6 +47,7 @@ from calib.inference.prior_files import (
     DeclaredPriors,
     PriorFile,
     default_priors,
+    inheritance_note,
     read_priors,
     relative_columns,
 )
@@ -349,7 +350,8 @@ def build_problem(
     table : Table, mapping of str to array_like, or pandas.DataFrame
         Calibration data with the model's conditions and its output.
     prior_path : path or PriorFile, optional
-        The model's own, or the shipped one, by default.
+        It may leave parameters to the model's own priors, or the shipped ones, which are taken by
+        default; `notes` of the problem then says which.
     fixed : mapping of str to float, optional
         Natural parameters to hold at a value.
 
@@ -390,15 +392,16 @@ def build_problem(
     except CalibError as error:
         raise error.within(table.source) from None
     assumed = {name: value for name, value in relative.items() if name not in references}
-    notes = tuple(
+    notes = [note] if (note := inheritance_note(priors, model.name)) else []
+    notes += [
         f"the data have no column {name}, so priors that are relative to it assume "
         f"{_with_unit(name, value)}; give it if yours differs"
         for name, value in assumed.items()
-    )
+    ]
     noise = noise_of(priors.noise, model.select(table.columns), priors.source)
     if model.uncertain is not None:
         noise.must_be_iid_normal(priors.source, f"the emulator {model.name}")
-    problem = Problem(bound, table, priors, notes, noise)
+    problem = Problem(bound, table, priors, tuple(notes), noise)
     _ = problem.serial  # refused here, not in the middle of an estimation
     problem = problem.with_fixed(fixed) if fixed else problem
     if not problem.names:

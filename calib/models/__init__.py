@@ -63,13 +63,19 @@ def template_csv(model_name: str) -> str:
     return "\n".join([f"{head},run_order", *numbered, ""])
 
 
+# Said to whom types commands, and to whom calls functions.
+DECLARE = (
+    "name the file that declares it: --models FILE or --simulator FILE; in Python, calib.register "
+    "the model, or what calib.read_simulator(FILE) returns"
+)
+
+
 def get_model(name: str) -> Model:
     """Return a model by its name; a CalibError lists those there are."""
     if name not in MODELS:
         raise CalibError(
             f"there is no model {name!r}",
             expected=", ".join(MODELS),
-            hint=f"{meant(name, MODELS, 'use one of these names,')} or name the file of your "
-            "models (--models FILE) or of your simulator (--simulator FILE)",
+            hint=f"{meant(name, MODELS, 'use one of these names,')} or {DECLARE}",
         )
     return MODELS[name]

@@ -110,6 +110,32 @@ def axis_of(column: str) -> Axis:
     return Axis(quantity.title, *(quantity.shown or (degrees(unit), 1.0)))
 
 
+def parameter_unit(unit: str, columns: Iterable[str]) -> tuple[str, float]:
+    """Return a parameter's unit made of those in which `axis_of` shows columns, and the factor.
+
+    Of two columns of one usual unit the first counts. What has a power that is a parameter stays.
+    """
+    axes: dict[str, Axis] = {}
+    for column in columns:
+        usual = QUANTITIES[column].unit.replace("**", "^").replace("*", " ")
+        axes.setdefault(degrees(usual), axis_of(column))
+    if unit in axes:
+        return axes[unit].unit, axes[unit].factor
+    factor = 1.0
+
+    def shown(part: re.Match[str]) -> str:
+        nonlocal factor
+        axis = axes.get(part["unit"])
+        if axis is None:
+            return part[0]
+        factor *= axis.factor ** ((-1 if part["per"] == "/" else 1) * int(part["power"] or 1))
+        whole = axis.unit if re.fullmatch(r"\w+", axis.unit) else f"({axis.unit})"
+        return f"{part['per']}{whole}{f'^{part["power"]}' if part['power'] else ''}"
+
+    parts = r"(?P<per>^|[/ ])(?P<unit>[A-Za-z]+)(?:\^(?P<power>-?\d+))?(?=[/ ]|$)"
+    return re.sub(parts, shown, unit), factor
+
+
 def stem_and_subscript(name: str) -> tuple[str, str]:
     """Split a parameter's name: ``K_lo`` into K and lo, ``C3`` into C and 3."""
     stem, _, below = name.partition("_")

@@ -22,7 +22,7 @@ from calib.inference.random import generator
 from calib.report.comparison import comparison_figure
 from calib.report.figures import bands, gap, style
 from calib.report.gap_words import Words
-from calib.report.labels import axis_of, units_of
+from calib.report.labels import axis_of, parameter_unit, units_of
 from calib.report.rows import Fitted
 from calib.report.verdict import verdict
 from calib.validation.comparison import Comparison
@@ -178,12 +178,19 @@ def html(found: Any) -> str:
 def _(found: Calibration) -> str:
     said = verdict(found)
     lines = [f"Trust: {said.trust}." * bool(said.trust), f"Not: {said.doubt}." * bool(said.doubt)]
-    return _page(said.headline, lines, found)
+    problem, table = found.problem, frame(found)
+    with units_of(problem.table.header):
+        columns = (problem.bound.model.output, *problem.conditions)
+        units = [parameter_unit(unit, columns) for unit in table["unit"]]
+    table["unit"] = [unit for unit, _ in units]
+    sizes = ["median", "mean", "sd", "hdi_lower", "hdi_upper"]
+    table[sizes] = table[sizes].mul([factor for _, factor in units], axis=0)
+    return _page(said.headline, lines, table)
 
 
 @html.register
 def _(found: Comparison) -> str:
-    return _page(found.sentence, (), found)
+    return _page(found.sentence, (), frame(found))
 
 
 @html.register
@@ -191,10 +198,10 @@ def _(found: Diagnosis) -> str:
     said = Words(gap_document(found)).verdict()
     facts = dict(said.facts)
     lines = [f"{label}: {facts[label]}" for label in ("Size", "Next") if label in facts]
-    return _page(said.headline, lines, found)
+    return _page(said.headline, lines, frame(found))
 
 
-def _page(headline: str, lines: Sequence[str], found: Any) -> str:
+def _page(headline: str, lines: Sequence[str], table: pd.DataFrame) -> str:
     said = "".join(f"<p>{escape(text)}</p>" for text in lines if text)
-    table = frame(found).to_html(float_format="%.4g", max_rows=40, border=0)
-    return f"<div><p><strong>{escape(headline)}</strong></p>{said}{table}</div>"
+    shown = table.to_html(float_format="%.4g", max_rows=40, border=0)
+    return f"<div><p><strong>{escape(headline)}</strong></p>{said}{shown}</div>"

@@ -34,7 +34,7 @@ from calib.inference.sampler import SamplerSettings
 from calib.models import MODELS, get_model
 from calib.models.base import Array
 from calib.report.constants import MAX_ROWS
-from calib.report.labels import degrees
+from calib.report.labels import degrees, joined
 from calib.report.verdict import Evidence, gather
 from calib.validation.comparison import NoisePreference, noise_preference
 from calib.validation.prediction import predictive_draws, prior_predictive
@@ -46,33 +46,39 @@ type Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class HoldOut:
-    """Rows kept for validation: a column as a header would name it, and its value."""
+    """Rows kept for validation: a column as a header would name it, and its value or values."""
 
     column: str
-    value: float
+    value: float | tuple[float, ...]
+
+    @property
+    def _numbers(self) -> list[str]:
+        values = [self.value] if isinstance(self.value, int | float) else self.value
+        return [f"{v:g}" for v in values]
 
     def __str__(self) -> str:
-        return f"{self.column} = {self.value:g}"
+        return f"{self.column} = {', '.join(self._numbers)}"
 
     @property
     def words(self) -> str:
-        """What is held out, as a heading says it: the quantity, its value and unit."""
+        """What is held out, as a heading says it: the quantity, its values and unit."""
         column = parse_header(self.column)
         if column is None:
             return str(self)
         unit = degrees(column.unit.replace("**", "^").replace("*", " "))
-        value = f"{column.quantity.word} {self.value:g}"
+        value = f"{column.quantity.word} {joined(self._numbers)}"
         return value if unit == "dimensionless" else f"{value} {unit}"
 
     @classmethod
     def parse(cls, text: str) -> HoldOut:
-        """Read ``COLUMN=VALUE``, or raise a CalibError."""
+        """Read ``COLUMN=VALUE`` or ``COLUMN=VALUE,VALUE``, or raise a CalibError."""
         column, equals, value = text.partition("=")
         try:
             if not equals:
                 raise ValueError
             parse_header(column.strip())
-            return cls(column.strip(), float(value))
+            first, *others = map(float, value.split(","))
+            return cls(column.strip(), (first, *others) if others else first)
         except CalibError as error:
             raise CalibError(
                 error.message, where=f"--hold-out {text}", expected=error.expected,
@@ -81,8 +87,8 @@ class HoldOut:
         except ValueError:
             raise CalibError(
                 f"cannot read --hold-out {text!r}",
-                expected="COLUMN=VALUE, for instance inflation_pressure_psi=30",
-                hint="name a column with its unit, an equals sign and one number",
+                expected="COLUMN=VALUE, for instance inflation_pressure_psi=30 or 18,30",
+                hint="name a column with its unit, an equals sign and numbers with commas between",
             ) from None
 
     def applies_to(self, table: Table) -> bool:

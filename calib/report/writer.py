@@ -18,10 +18,9 @@ from calib.batch.environment import Environment, sha256
 from calib.batch.folders import fresh_folder
 from calib.batch.pool import HERE
 from calib.data import write_table
-from calib.data.files import read_text
 from calib.inference.estimators import GeneticSettings, method_name
 from calib.inference.io import own_names, save_posterior
-from calib.inference.prior_files import default_priors
+from calib.inference.prior_files import default_priors, whole_text
 from calib.inference.sampler import SamplerSettings
 from calib.models import MODELS, get_model
 from calib.models.simulators.emulator import emulator_of, save_emulator
@@ -196,7 +195,7 @@ def _copy_inputs(study: Study, folder: Path) -> dict[str, dict[str, Any]]:
         prior_path = task.prior_path or default_priors(task.model)
         write_table(folder / "data" / f"{key}.csv", task.table.whole())
         data = (folder / "data" / f"{key}.csv").read_bytes()
-        priors = read_text(prior_path).encode()
+        priors = whole_text(prior_path, task.model).encode()
         (folder / "priors" / f"{key}.toml").write_bytes(priors)
         emulator = emulator_of(get_model(task.model))
         if emulator is not None:

@@ -131,8 +131,8 @@ def sentence(told_apart: Mapping[str, bool], unsound: Sequence[str]) -> str:
     """
     if unsound:
         return (
-            f"No preference is stated: {_joined(unsound)} did not converge. Raise --max-steps, or "
-            "give tighter priors."
+            f"No preference is stated: {_joined(unsound)} did not converge. Raise max_steps "
+            "(--max-steps), or give tighter priors."
         )
     best, *others = told_apart
     told = [m for m in others if told_apart[m]]
@@ -253,8 +253,8 @@ def check_comparable(models: Sequence[str]) -> None:
         raise CalibError(
             f"there is nothing to compare in {', '.join(models) or 'no model'}",
             expected="two or more models, each once",
-            hint="name two or more: calib compare MODEL MODEL my.csv, or calib report my.csv "
-            "--compare MODEL --compare MODEL",
+            hint="name two or more: calib.compare([MODEL, MODEL], table), or calib compare MODEL "
+            "MODEL my.csv, or calib report my.csv --compare MODEL --compare MODEL",
         )
     outputs = {name: get_model(name).output for name in models}
     if len(set(outputs.values())) > 1:

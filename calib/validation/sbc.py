@@ -380,14 +380,14 @@ def _claim(out: Path, run: dict[str, Any]) -> None:
                 raise CalibError(
                     "the folder holds replicates of another seed, other sampler settings or priors",
                     where=str(path),
-                    hint="choose another --out, or the seed that is there",
+                    hint="choose another folder, or the seed that is there",
                 )
             return
         if out.exists() and any(p.suffix != ".part" for p in out.iterdir()):
             raise CalibError(
                 "the output folder exists, is not empty and holds no simulation-based calibration",
                 where=str(out),
-                hint="choose another --out",
+                hint="choose another folder",
             )
         out.mkdir(parents=True, exist_ok=True)
         write_whole(path, text)

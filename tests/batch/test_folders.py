@@ -101,7 +101,7 @@ def test_an_earlier_result_is_replaced_only_on_request_and_an_empty_folder_is_us
     out.mkdir()
     with fresh_folder(out) as folder:
         (folder / "manifest.json").write_text("old")
-    assert "pass --overwrite" in refusal(out)
+    assert "--overwrite, in Python overwrite=True" in refusal(out)
     with fresh_folder(out, overwrite=True) as folder:
         (folder / "new").write_text("x")
     assert contents(tmp_path) == {"run", "run/new"}

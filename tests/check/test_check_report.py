@@ -7,6 +7,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,9 @@ from calib.batch.environment import sha256
 from calib.checking.check import check
 from calib.checking.compare import Status
 from calib.errors import CalibError
+from calib.inference import prior_files
 from calib.inference.prior_files import default_priors
+from calib.report.sections import work_out
 from tests.check.conftest import (
     different,
     edit_json,
@@ -29,7 +32,7 @@ from tests.check.conftest import (
     seal,
     swap_figures,
 )
-from tests.check.made import rut_study, write
+from tests.check.made import SETTINGS, rut_study, rut_tasks, write
 
 pytestmark = pytest.mark.usefixtures("computed_once")
 
@@ -440,3 +443,26 @@ def test_priors_of_another_version_are_not_called_wrong(report: Path) -> None:
     assert outcome.exit_code == 0
     (item,) = outcome.of(Status.UNJUDGED)
     assert item.name == "priors/rut_depth.toml"
+
+
+def test_priors_that_a_file_left_out_are_kept_and_held_against_the_shipped_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mine, later = tmp_path / "mine.toml", tmp_path / "later"
+    shipped = default_priors("modified_bekker").read_text(encoding="utf-8")
+    mine.write_text(
+        'model = "modified_bekker"\n[parameters.n1]\ndist = "normal"\nmean = 0.4\nsd = 0.5\n'
+        'unit = "1"\nreason = "a test"\nsource = "nobody"\n'
+    )
+    tasks = [replace(task, prior_path=mine) for task in rut_tasks()]
+    folder = write(work_out(tasks, 2019, settings=SETTINGS), tmp_path / "report")
+    assert "mine.toml sets the prior of" in (folder / "index.html").read_text(encoding="utf-8")
+    mine.unlink()
+    assert different(check(folder)) == {}
+    # With other priors shipped, nothing moves but what is said of those in the file.
+    later.mkdir()
+    (later / "modified_bekker.toml").write_text(shipped.replace("median = 25.0", "median = 2.5"))
+    monkeypatch.setattr(prior_files, "_shipped", lambda: later)
+    assert different(check(folder, quick=True)) == {
+        "priors/rut_depth.toml": "z_ref: not as in the modified_bekker.toml of this version"
+    }

@@ -116,7 +116,7 @@ def test_an_earlier_run_is_replaced_on_request_only(calib: Calib, run: Path) -> 
     command = ["fit", "my.csv", "--model", "modified_bekker", "--out", run, "--max-steps", 100]
     refused = calib(*command)
     assert refused.code == 2
-    assert "pass --overwrite" in refused.err
+    assert "--overwrite" in refused.err
     command.append("--overwrite")
     Path("run/notes.txt").write_text("mine")
     kept = calib(*command)
@@ -286,7 +286,7 @@ def prior_text(old: str, new: str) -> str:
     [
         (
             prior_text("parameters.n0", "parameters.n9"),
-            ["unknown parameter n9", "missing parameter n0", "z_ref, n0, n1, sigma"],
+            ["unknown parameter n9", "did you mean n0?", "z_ref, n0, n1, sigma"],
         ),
         (prior_text("sd = 0.75", "sd = 0.0"), ["parameters.n1", "sd", "greater than 0"]),
         (prior_text("sd = 0.75", "sd = -2"), ["parameters.n1", "sd", "-2", "greater than 0"]),
@@ -446,6 +446,18 @@ def test_a_dry_run_checks_the_input_and_computes_nothing(calib: Calib) -> None:
     assert not Path("calib-run").exists()
     Path("bad.csv").write_text(RUT.replace("rut_depth", "rut_dept"))
     assert calib("fit", "bad.csv", "--model", "modified_bekker", "--dry-run").code == 2
+
+
+def test_a_dry_run_says_that_pressures_are_as_in_another_unit(calib: Calib) -> None:
+    head, *rows = template_csv("magic_formula_pressure").splitlines()
+    cells = [row.split(",") for row in rows]
+    at = head.split(",").index("inflation_pressure_psi")
+    for row in cells:
+        row[at] = f"{6.894757 * float(row[at]):.0f}"
+    Path("kpa.csv").write_text("\n".join([head, *map(",".join, cells)]) + "\n")
+    ran = calib("fit", "kpa.csv", "--model", "magic_formula_pressure", "--dry-run")
+    assert ran.code == 0
+    assert "all would be inside if the readings are in kPa" in ran.out
 
 
 def test_quiet_leaves_warnings_and_errors(calib: Calib) -> None:

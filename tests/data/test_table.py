@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -62,6 +63,28 @@ def test_an_absent_column_lists_the_present_ones() -> None:
     with pytest.raises(CalibError, match="no column 'speed_m_s'") as caught:
         pressures()["speed_m_s"]
     assert "expected: inflation_pressure_psi, slip_ratio" in str(caught.value)
+    assert "add the column" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [
+        ("slip_percent", "use 'slip_ratio': a table keeps every quantity in one unit"),
+        ("slip_foot", "did you mean slip_ratio?"),
+        ("slip", "did you mean slip_ratio?"),
+    ],
+)
+def test_of_another_name_of_a_column_its_own_is_said(name: str, hint: str) -> None:
+    with pytest.raises(CalibError) as caught:
+        pressures()[name]
+    assert caught.value.hint == hint
+
+
+@pytest.mark.parametrize("convert", [np.asarray, pd.DataFrame])
+def test_a_table_is_not_taken_for_the_names_of_its_columns(convert: type) -> None:
+    with pytest.raises(CalibError, match="not an array") as caught:
+        convert(pressures())
+    assert "table.to_dataframe() has all" in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -78,6 +101,8 @@ def test_hold_out_in_any_unit(header: str, value: float) -> None:
     assert rest.lines.tolist() == [0, 2]
     zero = table_from_arrays({"slip_ratio": [0.0, 0.1, 0.2]})
     assert len(hold_out(zero, "slip_percent", 0)[1]) == 1
+    for several in ([0, 20], (0.0, 20.0), np.array([0.0, 20.0])):
+        assert hold_out(zero, "slip_percent", several)[0]["slip_ratio"].tolist() == [0.1]
 
 
 @pytest.mark.parametrize(
@@ -86,11 +111,12 @@ def test_hold_out_in_any_unit(header: str, value: float) -> None:
         ("inflation_pressure_kpa", 30, ["no row is at 30", "124.106, 206.843, 206.9, 289.58"]),
         ("slip_percent", 10, ["every row is at 10", "nothing would be left to fit"]),
         ("slip_percent", 20, ["no row is at 20", "values present: 10"]),
+        ("inflation_pressure_psi", [18, 31, 33], ["no row is at 31 or 33", "30, 30.0"]),
         ("speed_m_s", 1, ["no column to hold 'speed_m_s' out", "inflation_pressure_psi"]),
         ("inflaton_presure_psi", 18, ["no column", "did you mean inflation_pressure_psi?"]),
     ],
 )
-def test_impossible_hold_outs(header: str, value: float, words: list[str]) -> None:
+def test_impossible_hold_outs(header: str, value: float | list[float], words: list[str]) -> None:
     with pytest.raises(CalibError) as caught:
         hold_out(pressures(), header, value)
     for word in ["lab.csv", *words]:

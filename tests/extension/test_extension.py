@@ -87,7 +87,8 @@ def test_a_new_output_its_model_and_its_effect_go_through_every_verb(run: Calib)
     assert checked.code == 0, checked.out
     assert checked.out.startswith("SAME")
     # Without the file nobody knows the model; the message says how to name it.
-    assert "--models FILE" in run("template", "my_pull").err
+    assert "--models FILE" in (said := run("template", "my_pull").err)
+    assert "in Python, calib.register" in said
     Path("field.csv").write_text(field_of(example, np.random.default_rng(1)))
     found = run("diagnose", "--run", "run", "--field", "field.csv", *mine, "--out", "gap",
                 "--workers", 1)  # fmt: skip

@@ -30,7 +30,7 @@ from calib.gap.case import (
     words_of,
 )
 from calib.gap.corrected import load_corrected, predict_columns, save_corrected
-from calib.gap.diagnose import diagnose_once
+from calib.gap.diagnose import diagnose, diagnose_once
 from calib.gap.effects import EFFECTS
 from calib.gap.files import document
 from calib.gap.hypotheses import Hypothesis, unusual_sizes, with_known_size
@@ -141,18 +141,22 @@ def test_a_case_may_bring_the_priors_of_its_simulators(tmp_path):
     """And they go with it, to where a corrected model is kept."""
     folder = write_case(make_case("force_offset", models=PULL_ONLY), tmp_path / "case")
     text = narrow_priors(default_priors(PULL_ONLY["drawbar_pull"]).read_text(encoding="utf-8"))
+    left_out = "[parameters.sigma]"
+    text = text[: text.index(left_out)]
     (folder / "mine.toml").write_text(text, encoding="utf-8")
     with (folder / "case.toml").open("a", encoding="utf-8") as file:
         file.write('\n[priors]\ndrawbar_pull = "mine.toml"\n[context]\nsame_soil = false\n')
     case = read_case(folder)
     assert case_files(folder)[1]["priors.drawbar_pull"] == folder / "mine.toml"
     (output,) = campaigns(case).outputs
-    assert output.problem.priors.text == text
+    used = output.problem.priors.text
+    assert used.startswith(text.rstrip())
+    assert left_out in used
     found = diagnose_once(case, 1, effects={"force_offset": EFFECTS["force_offset"]})
     (tmp_path / "out").mkdir()
     save_corrected(found.corrected, tmp_path / "out")
     kept = load_corrected(tmp_path / "out").data
-    assert kept.outputs[0].problem.priors.text == text
+    assert kept.case.priors["drawbar_pull"].text == used
     assert kept.case.context == Context(same_soil=False)
     recorded = json.loads(inputs_record(case, 1))
     assert recorded["priors"] == case_hashes(folder)["priors"]
@@ -246,9 +250,9 @@ def fake_ranking():
 
 def test_an_excluded_cause_is_not_tested_and_both_verdicts_are_told():
     case = make_case("sensor_drift", models=PULL_ONLY)
-    found = diagnose_once(
-        replace(case, context=Context(excluded=("sensor_drift",))), 1, effects=CHOICE
-    )
+    # Given as an argument it takes the place of the case's own.
+    own = replace(case, context=Context(excluded=("nobody_knows",)))
+    found = diagnose(own, 1, effects=CHOICE, context={"excluded": ["sensor_drift"]})
     assert "sensor_drift" not in found.inclusion.causes
     assert "excluded" in found.ranking.not_testable["sensor_drift"]
     assert found.without_context is not None
@@ -312,6 +316,15 @@ def test_names_that_nobody_knows_are_refused(context):
     case = make_case("force_offset", models=PULL_ONLY)
     with pytest.raises(CalibError, match=r"no cause that is known|always considered|no parameter"):
         diagnose_once(replace(case, context=context), 1)
+
+
+def test_what_is_wrong_in_an_argument_is_said_as_of_a_file():
+    case = make_case("force_offset", models=PULL_ONLY)
+    with pytest.raises(CalibError, match="unknown key exclude") as refused:
+        diagnose(case, context={"exclude": ["sensor_drift"]})
+    assert (refused.value.where, refused.value.hint) == (
+        "calib.diagnose, context.exclude", "did you mean excluded?"
+    )  # fmt: skip
 
 
 def test_of_a_misspelt_cause_the_one_most_like_it_is_named():

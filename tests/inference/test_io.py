@@ -167,6 +167,23 @@ def test_equal_results_give_equal_files(
         assert (tmp_path / name).read_bytes() == (saved / name).read_bytes(), name
 
 
+def test_a_run_is_replaced_only_where_that_is_asked_for(
+    rut_calibration: Calibration, saved: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(saved, folder)
+    before = (folder / "run.json").read_bytes()
+    (folder / "run.json").write_bytes(before + b"\n")
+    with pytest.raises(CalibError, match="exists and is not empty"):
+        save_calibration(rut_calibration, folder)
+    assert (folder / "run.json").read_bytes() == before + b"\n"
+    save_calibration(rut_calibration, folder, overwrite=True)
+    assert (folder / "run.json").read_bytes() == before
+    (folder / "notes.txt").write_text("mine")
+    with pytest.raises(CalibError, match=r"calib did not write: notes\.txt"):
+        save_calibration(rut_calibration, folder, overwrite=True)
+
+
 def test_fixed_parameters_and_loads_survive(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     slip = np.linspace(0.0, 0.6, 12)

@@ -12,13 +12,17 @@ from scipy import stats
 
 from calib.batch.user_code import run_file
 from calib.errors import CalibError
+from calib.he2019.embedded import load_he2019
+from calib.inference import prior_files
 from calib.inference.prior_files import (
     default_priors,
+    inheritance_note,
     parse_priors,
     read_priors,
     relative_columns,
 )
 from calib.inference.priors import Priors, prior_references
+from calib.inference.problem import Problem, build_problem
 from calib.models import MODELS
 
 ENTRY = '[parameters.{name}]\nunit = "1"\nreason = "a test"\nsource = "nobody"\n'
@@ -311,6 +315,74 @@ def test_unreadable_files_are_told(tmp_path: Path) -> None:
     for path in (tmp_path / "absent.toml", tmp_path, latin):
         message = refusal(lambda p=path: read_priors(p, "m", ("x",), {}))
         assert f"{path}: the prior file cannot be read" in message
+
+
+# What a file leaves out
+
+
+N_ALONE = 'model = "bekker"\n\n[parameters.n]  # ours\n' + (
+    'dist = "normal"\nmean = 1.0\nsd = 0.1\nunit = "1"\nreason = "plates"\nsource = "own"\n'
+)
+
+
+def bekker(tmp_path: Path, text: str) -> Problem:
+    path = tmp_path / "mine.toml"
+    path.write_text(text, encoding="utf-8")
+    return build_problem("bekker", load_he2019("rut_depth"), path)
+
+
+def test_what_a_file_leaves_out_is_as_shipped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = bekker(tmp_path, N_ALONE)
+    z_ref, n, sigma = problem.priors.entries
+    shipped = build_problem("bekker", load_he2019("rut_depth")).priors.entries
+    assert (z_ref, sigma) == (shipped[0], shipped[2])
+    assert (n.loc, n.scale, n.source) == (1.0, 0.1, "own")
+    assert problem.notes == (
+        "mine.toml sets the prior of n; those of z_ref, sigma are the shipped ones",
+    )
+    # What is kept is the whole set, whatever will be shipped later.
+    kept = problem.priors.text
+    assert kept.startswith(N_ALONE)
+    monkeypatch.setattr(prior_files, "_shipped", lambda: tmp_path)
+    again = bekker(tmp_path, kept)
+    assert again.priors.entries == problem.priors.entries
+    assert again.notes == problem.notes
+
+
+def test_a_file_may_choose_the_noise_alone(tmp_path: Path) -> None:
+    problem = bekker(tmp_path, 'model = "bekker"\n[likelihood]\nfamily = "student_t"')
+    assert problem.names == ("z_ref", "n", "nu", "sigma")
+    assert problem.notes == ("mine.toml sets no prior; all are the shipped ones",)
+
+
+def test_a_misspelt_parameter_is_none_that_is_left_out(tmp_path: Path) -> None:
+    message = refusal(lambda: bekker(tmp_path, N_ALONE.replace("s.n]", "s.zref]")))
+    assert "mine.toml, [parameters]: unknown parameter zref\n" in message
+    assert "zref: did you mean z_ref? correct the name" in message
+
+
+def test_an_inline_table_is_not_completed(tmp_path: Path) -> None:
+    text = 'model = "bekker"\nparameters = {n = {dist = "fixed", value = 1.0}}'
+    message = refusal(lambda: bekker(tmp_path, text))
+    assert "missing parameter z_ref, sigma" in message
+    assert "each as a table [parameters.NAME]" in message
+
+
+def test_what_a_file_leaves_out_is_as_the_model_declares_it(tmp_path: Path) -> None:
+    path, mine = tmp_path / "model.py", tmp_path / "mine.toml"
+    path.write_text(DECLARED.replace("gaussian", "normal"))
+    mine.write_text(
+        N_ALONE.replace("bekker", "flat_pull").replace("s.n]", "s.a]").replace('"1"', '"kN"')
+    )
+    try:
+        run_file(path, "models")
+        read = read_priors(mine, "flat_pull", ("a", "sigma"), {})
+        assert [p.source for p in read.entries] == ["own", "nobody"]
+        assert inheritance_note(read, "flat_pull").endswith("those of sigma are the model's own")
+    finally:
+        MODELS.discard("flat_pull")
 
 
 # What is shipped

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import cache
 
 import numpy as np
@@ -50,6 +51,19 @@ def test_every_result_has_a_short_name_a_table_a_figure_and_a_view(i):
     frame = found.to_dataframe()
     assert len(frame) >= 2
     assert "<table" in found._repr_html_()
+
+
+def test_a_card_has_one_unit_for_a_quantity():
+    pulls = calib.load_he2019("drawbar_pull")
+    newtons = {name: pulls[name] for name in PULLS}
+    newtons["drawbar_pull_n"] = 1000.0 * pulls["drawbar_pull_kn"]
+    problem = calib.build_problem("magic_formula_pressure", newtons)
+    card = calib.calibrate(problem, seed=1)._repr_html_()
+    assert "kN" not in card
+    cells = re.search(r"<th>D_lo</th>\s*<td>(.*?)</td>\s*<td>(.*?)</td>", card)
+    assert cells is not None
+    assert cells[1] == "N"
+    assert float(cells[2]) == pytest.approx(1000.0 * calibrated().summary["D_lo"].median, rel=0.02)
 
 
 def test_parameters_come_first_and_then_what_is_published_of_them():

@@ -158,6 +158,7 @@ def test_models_and_priors_can_be_given(tmp_path: Path) -> None:
         ("inflation_pressure_kpa=160", "inflation pressure 160 kPa"),
         ("bulk_density_g_cm3=1.5", "bulk density 1.5 g/cm^3"),
         ("pass_number=2", "pass number 2"),
+        ("inflation_pressure_psi=18,30", "inflation pressure 18 and 30 psi"),
     ],
 )
 def test_a_hold_out_is_read_and_said(text: str, words: str) -> None:

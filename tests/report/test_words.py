@@ -20,6 +20,7 @@ from calib.report.labels import (
     axis_of,
     joined,
     parameter_label,
+    parameter_unit,
     percent,
     plain,
     symbol,
@@ -288,6 +289,26 @@ def test_percent_and_joined():
     assert percent(0.0294) == "2.9 %"
     assert joined(["a"]) == "a"
     assert joined(["a", "b", "c"]) == "a, b and c"
+
+
+@pytest.mark.parametrize(
+    ("unit", "shown", "factor"),
+    [
+        ("kN", "N", 1e3),
+        ("kN/%/psi^2", "N/%/kPa^2", 1e3 / 6.894757**2),
+        ("1/psi", "1/kPa", 1.0 / 6.894757),
+        ("kPa/m^n", "psi/m^n", 1.0 / 6.894757),
+        ("kPa (g/cm^3)^-C4", "psi (g/cm^3)^-C4", 1.0 / 6.894757),
+        ("mm", "mm", 1.0),
+        ("1", "1", 1.0),
+    ],
+)
+def test_parameters_may_have_the_units_of_the_file(unit, shown, factor):
+    headers = ["drawbar_pull_n", "inflation_pressure_kpa", "average_ground_pressure_psi"]
+    columns = ["drawbar_pull_kn", "inflation_pressure_psi", "average_ground_pressure_kpa"]
+    with units_of(headers):
+        found = parameter_unit(unit, [*columns, "slip_ratio", "normal_load_kn"])
+    assert found == (shown, pytest.approx(factor))
 
 
 def test_a_page_has_the_units_of_its_file():

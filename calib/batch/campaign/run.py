@@ -23,7 +23,7 @@ from pydantic import ValidationError
 from calib.batch.campaign.kind import Kind, Place, Section, Task
 from calib.batch.campaign.kinds import KINDS
 from calib.batch.environment import sha256, versions
-from calib.batch.folders import check_folder, check_room, write_whole, writing
+from calib.batch.folders import REPLACE, check_folder, check_room, write_whole, writing
 from calib.batch.tasks import check_names, failed_tasks, run_tasks
 from calib.data.files import TOML_HINT, decoded
 from calib.errors import CalibError
@@ -287,7 +287,7 @@ def _discard_changed(
             f"from something else than the plan now says: {name} differs in {what}",
             where=str(results),
             expected="the plan, the data and the versions that the results there were made from",
-            hint="choose another --out, or pass --overwrite to do these tasks again",
+            hint=f"{REPLACE}; these tasks are then done again",
         )
     for name in changed:
         # Without its record, a folder that a kill leaves half removed is not taken for a result.

@@ -221,7 +221,7 @@ def _parsed(header: str, name: str) -> tuple[str, str]:
         raise CalibError(
             f"{header!r} is no known quantity with a unit", where=f"simulator {name}",
             expected=", ".join(QUANTITIES) + ", or the same in another unit",
-            hint="correct the name, or register a Quantity for it in a file given by --models",
+            hint="correct the name, or calib.register a Quantity of it (in a file for --models)",
         )  # fmt: skip
     return found.quantity.canonical, found.unit
 
