@@ -206,7 +206,7 @@ def test_a_run_says_nothing_of_the_computer_it_was_made_on(run: Path) -> None:
         (lambda m: m["settings"].update(ensembles=0), "ensembles = 0"),
         (lambda m: m.pop("code"), "code"),
         (lambda m: m.update(schema="calib/run/0"), "calib/run/0"),
-        (lambda m: m.update(model="pacejka"), "hint: pass the file of your own that declares it"),
+        (lambda m: m.update(model="pacejka"), "hint: name the file that declares it"),
         (lambda m: m.update(references={"p": "high"}), "references"),
     ],
 )
