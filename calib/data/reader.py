@@ -507,13 +507,15 @@ def table_from_arrays(
     return _labelled(table, ignored)
 
 
-def as_table(data: Tabular) -> Table:
+def as_table(data: Tabular, *, allow_missing: Sequence[str] = ()) -> Table:
     """Return a table as it is; read a file; make a table of a mapping or a data frame.
 
     Parameters
     ----------
     data : Table, path of a CSV, mapping of str to array_like, or pandas.DataFrame
         Column names with units, as in a file, to values.
+    allow_missing : sequence of str
+        Canonical columns in which a value may be missing.
 
     Raises
     ------
@@ -528,7 +530,7 @@ def as_table(data: Tabular) -> Table:
     if isinstance(data, Table):
         return data
     if isinstance(data, str | os.PathLike):
-        return read_table(data)
+        return read_table(data, allow_missing=allow_missing)
     if not hasattr(data, "items"):
         raise CalibError(
             f"{type(data).__name__} is no table",
@@ -543,7 +545,7 @@ def as_table(data: Tabular) -> Table:
             expected="each column once",
             hint="drop one of them",
         )
-    return table_from_arrays(dict(pairs))
+    return table_from_arrays(dict(pairs), allow_missing=allow_missing)
 
 
 def _is_text(value: object) -> bool:

@@ -12,6 +12,7 @@ import numpy as np
 from calib.arguments import takes
 from calib.inference.diagnostics import convergence, ess, hdi, hdi_error, median_error
 from calib.inference.estimators import PointEstimate
+from calib.inference.priors import Priors
 from calib.inference.problem import Problem
 from calib.inference.random import stream
 from calib.inference.sampler import Draws, Progress, SamplerSettings, sample_posterior
@@ -113,9 +114,28 @@ class Calibration(Shown):
 def _summarise(calibration: Calibration) -> dict[str, ParameterSummary]:
     problem = calibration.problem
     units = {**problem.bound.model.reported, **{p.name: p.unit for p in problem.priors.entries}}
-    names = tuple(calibration.parameters)
-    stacked = np.stack([calibration.parameters[name] for name in names], axis=-1)
-    ensembles, walkers, steps, _ = calibration.draws.t.shape
+    ratios = sd_ratios(problem.priors, calibration.draws.flat)
+    return summarise(calibration.parameters, units, calibration.draws.t.shape[:3], ratios)
+
+
+def sd_ratios(priors: Priors, flat: Array) -> dict[str, float]:
+    """Return posterior over prior sds of free parameters, whose draws are (n, d).
+
+    In internal coordinates, where a log-normal's is finite and meaningful.
+    """
+    levels = (np.arange(999) + 0.5) / 999.0
+    prior = priors.ppf(levels[:, None] * np.ones(len(priors.free)))
+    ratios = flat.std(axis=0) / prior.std(axis=0)
+    return dict(zip(priors.names, ratios.tolist(), strict=True))
+
+
+def summarise(
+    parameters: Mapping[str, Array], units: Mapping[str, str], shape: tuple[int, ...],
+    sd_ratio: Mapping[str, float],
+) -> dict[str, ParameterSummary]:  # fmt: skip
+    """Summarise draws (chains, draws) by name, of ensembles, walkers and steps of a shape."""
+    names, (ensembles, walkers, steps) = tuple(parameters), shape
+    stacked = np.stack([parameters[name] for name in names], axis=-1)
     rhat, bulk, tail = convergence(stacked.reshape(ensembles, walkers, steps, -1))
     mean_ess = ess(stacked, "mean")
     flat = stacked.reshape(-1, len(names))
@@ -125,11 +145,6 @@ def _summarise(calibration: Calibration) -> dict[str, ParameterSummary]:
     batches = kept.reshape(ensembles, walkers, parts, -1, len(names)).transpose(4, 0, 2, 1, 3)
     batches = batches.reshape(len(names), ensembles * parts, -1)
     interval_error = [hdi_error(each, 0.95) for each in batches]
-    # Sds in internal coordinates, where a log-normal's is finite and meaningful.
-    priors, levels = problem.priors, (np.arange(999) + 0.5) / 999.0
-    prior = priors.ppf(levels[:, None] * np.ones(len(priors.free)))
-    ratios = calibration.draws.flat.std(axis=0) / prior.std(axis=0)
-    sd_ratio = dict(zip(problem.names, ratios.tolist(), strict=True))
     return {
         name: ParameterSummary(
             name=name,

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.special import logsumexp
 
 from calib.batch.environment import one_thread
@@ -31,7 +32,7 @@ from calib.inference.diagnostics import (
     longest_autocorrelation_time,
 )
 from calib.inference.mode import LogProb, Mode, find_modes
-from calib.inference.priors import SumAndRatio, sum_and_ratio
+from calib.inference.priors import Priors, SumAndRatio, sum_and_ratio
 from calib.inference.problem import Problem
 from calib.inference.proposal import Guess, Proposal, adapt, moments, refit, systematic
 from calib.inference.search import representative_rows
@@ -180,13 +181,12 @@ def sample_posterior(
     count_rough = count if rough is problem else _Counter(rough.log_prob)
     annealed = None
     if chosen.ensembles >= LEAST_ENSEMBLES:
-        drawn = priors.sample(rng, max(512, walkers))
-        annealed = anneal(priors.log_prob, count_rough, drawn, rng)
+        annealed = _from_prior(count_rough, priors, rng, walkers)
         if annealed is not None and rough is not problem:
             some = annealed[rng.permutation(len(annealed))[:walkers]]
             annealed = anneal(count_rough, count, some, rng)
         if annealed is None:
-            raise _nowhere(problem)
+            raise _nowhere(problem.table.source)
         annealed = annealed[rng.permutation(len(annealed))]  # copies stand side by side
         some = annealed[:24]
         starts = some if starts is None else np.concatenate([np.atleast_2d(starts), some])
@@ -196,7 +196,7 @@ def sample_posterior(
         modes = find_modes(count, priors, rng, starts=near, spread=0)
         count.evaluations += count_rough.evaluations
     if not np.isfinite(modes[0].log_prob):
-        raise _nowhere(problem)
+        raise _nowhere(problem.table.source)
     _refuse_exact(problem, modes[0])
     draws = sample_density(
         count, _guesses(modes, annealed), seeds, problem.names, chosen, rng=rng,
@@ -214,10 +214,59 @@ def sample_posterior(
     return replace(draws, t=t, report=report, mode=priors.by_parameter(draws.mode))
 
 
-def _nowhere(problem: Problem) -> CalibError:
+def sample_joint(
+    log_prob: LogProb,
+    priors: Priors,
+    seed: np.random.SeedSequence,
+    names: tuple[str, ...],
+    settings: SamplerSettings,
+    *,
+    where: str,
+    dear: bool = False,
+    progress: Progress | None = None,
+) -> Draws:
+    """Sample a density of coordinates (k, d), the first of which have priors.
+
+    The others, if there are any, are nearly independent of them and standard normal. Modes are
+    sought, and the prior is carried to the posterior, where these are zero. `dear` is whether an
+    evaluation is, `where` names the data.
+    """
+    rest = len(names) - len(priors.free)
+    few = 64 if dear else 320
+    chosen = replace(settings, walkers=settings.walkers or max(few, 2 * (len(names) + 1)))
+    walkers, seeds = chosen.n_walkers(len(names)), seed.spawn(1 + chosen.ensembles)
+    rng, count = np.random.default_rng(seeds[0]), _Counter(log_prob)
+
+    def of_first(h: Array) -> Array:
+        return count(np.column_stack([h, np.zeros((len(h), rest))]))
+
+    annealed = _from_prior(of_first, priors, rng, walkers)
+    if annealed is None:
+        raise _nowhere(where)
+    annealed = annealed[rng.permutation(len(annealed))]
+    modes = find_modes(of_first, priors, rng, starts=annealed[:24])
+    guesses = [
+        Guess(np.append(g.mean, np.zeros(rest)), block_diag(g.cholesky, np.eye(rest)))
+        for g in _guesses(modes, annealed)
+    ]
+    starts = np.column_stack([annealed[:walkers], rng.standard_normal((walkers, rest))])
+    return sample_density(
+        count, guesses, seeds, names, chosen, rng=rng,
+        last_starts=starts if chosen.ensembles >= LEAST_ENSEMBLES else None, progress=progress,
+    )  # fmt: skip
+
+
+def _from_prior(
+    log_prob: LogProb, priors: Priors, rng: np.random.Generator, walkers: int
+) -> Array | None:
+    """Carry draws of the prior to a density by sequential Monte Carlo; None where it is zero."""
+    return anneal(priors.log_prob, log_prob, priors.sample(rng, max(512, walkers)), rng)
+
+
+def _nowhere(where: str) -> CalibError:
     return CalibError(
         "no parameter values of positive probability were found",
-        where=problem.table.source,
+        where=where,
         hint="check that the data's units and the priors' scales fit each other",
     )
 
