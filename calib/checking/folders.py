@@ -15,7 +15,18 @@ from pydantic import Field
 
 from calib.batch.environment import Environment, differs_in_lines, sha256, unix_lines
 from calib.checking import compare
-from calib.checking.compare import FIGURES, INPUTS, LINE_ENDS, PAGE, TEXT, Item, Job, Status, claim
+from calib.checking.compare import (
+    FIGURES,
+    INPUTS,
+    LINE_ENDS,
+    PAGE,
+    POSTERIORS,
+    TEXT,
+    Item,
+    Job,
+    Status,
+    claim,
+)
 from calib.checking.tolerances import drawn_in_comparison, drawn_in_run
 from calib.data import Table
 from calib.data import files as data_files
@@ -175,7 +186,10 @@ def check_run(record: RunRecord, job: Job) -> list[Item]:
     with compare.not_computed(items, job.folder, RUN):
         problem = run_problem(record, job.folder / DATA)
         items += _consistent_run(record, problem, job)
-        if not job.quick:
+        if record.part_of:
+            wrong = f"part of a joint posterior ({record.part_of}), which is not sampled again here"
+            items.append(claim(POSTERIORS, POSTERIOR, wrong, sure=False))
+        elif not job.quick:
             calibration = recompute_run(record, problem, job.made, job.progress)
             items += _compare_run(record, calibration, job)
     return items

@@ -54,6 +54,8 @@ class Calibration(Shown):
         That seeded the sampler.
     settings : SamplerSettings
         How it was sampled.
+    part_of : str
+        The joint posterior that its draws are a part of; empty of one by itself.
     """
 
     problem: Problem
@@ -62,6 +64,7 @@ class Calibration(Shown):
     label: str
     estimates: tuple[PointEstimate, ...] = ()
     settings: SamplerSettings = field(default_factory=SamplerSettings)
+    part_of: str = ""
 
     def __repr__(self) -> str:
         state = "converged" if self.converged else "NOT CONVERGED"

@@ -140,6 +140,7 @@ class RunRecord(Record):
     data_source: str
     data_label: str
     header: tuple[str, ...] = ()
+    part_of: str = ""
     sha256: dict[File, Hash]
 
 
@@ -368,6 +369,7 @@ def _describe(calibration: Calibration) -> dict[str, Any]:
         "data_label": problem.table.label,
         # Units are shown as in the file, of which the copy has other names.
         **own_names(problem.table),
+        **({"part_of": calibration.part_of} if calibration.part_of else {}),
         "gate": {
             "passed": report.passed,
             "reasons": list(report.reasons),
@@ -489,7 +491,7 @@ def load_calibration(folder: Path) -> Calibration:
             walkers=meta.get("walkers", t.shape[1]),  # earlier run folders had all stored
             **{k: meta[k] for k in (*_OF_DRAWS, "seconds")},
         )  # fmt: skip
-        calibration = Calibration(problem, draws, record.seed, record.label)
+        calibration = Calibration(problem, draws, record.seed, record.label, part_of=record.part_of)
         _ = calibration.parameters  # what cannot be reported is damaged as well
         return calibration
 

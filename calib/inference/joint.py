@@ -110,7 +110,7 @@ class _Centre:
 
 @dataclass(frozen=True, repr=False)
 class JointProblem:
-    """Parts that share parameters, as one log density; make it with `calib.build_joint`.
+    """Parts that share parameters, as one log density; made by `build_joint`.
 
     Parameters
     ----------
@@ -285,8 +285,9 @@ def build_joint(
     Examples
     --------
     >>> import calib
+    >>> from calib.inference.joint import build_joint
     >>> ruts = calib.load_he2019("rut_depth")
-    >>> joint = calib.build_joint({"modified_bekker": ruts}, group="slip_percent", pooled=["z_ref"])
+    >>> joint = build_joint({"modified_bekker": ruts}, group="slip_ratio", pooled=["z_ref"])
     >>> joint.names[:4]
     ('z_ref', 'n0', 'n1', 'sigma')
     """
@@ -298,7 +299,7 @@ def build_joint(
         output = output_of(model.output)
         if output in wholes:
             raise CalibError(
-                f"two models predict {output}", where="calib.build_joint",
+                f"two models predict {output}", where="build_joint",
                 expected="one model for each output", hint="compare them (`calib.compare`)",
             )  # fmt: skip
         wholes[output] = build_problem(name, table, files.get(name))
@@ -306,7 +307,7 @@ def build_joint(
             labels[output] = _labels(table, group)
     if bool(group) != bool(pooled):
         raise CalibError(
-            "groups and pooled parameters belong together", where="calib.build_joint",
+            "groups and pooled parameters belong together", where="build_joint",
             expected="both group and pooled, or neither",
             hint="name the column of the groups, and the parameters that differ between them",
         )  # fmt: skip
@@ -315,7 +316,7 @@ def build_joint(
     if missing := [p for p in pooled if p not in names or p.startswith(_OF_NOISE)]:
         raise CalibError(
             f"no parameter that can differ between groups: {', '.join(missing)}",
-            where="calib.build_joint, pooled",
+            where="build_joint, pooled",
             expected=", ".join(n for n in names if not n.startswith(_OF_NOISE)),
             hint="name some of these",
         )
@@ -323,7 +324,7 @@ def build_joint(
     if group and len(groups) < 3:
         raise CalibError(
             f"the column {group!r} has {len(groups)} different values",
-            where="calib.build_joint, group", expected="at least three groups",
+            where="build_joint, group", expected="at least three groups",
             hint="of one or two groups no spread can be estimated: fit each by itself",
         )  # fmt: skip
     entries += [_between(p) for p in entries if p.name in pooled]
@@ -513,7 +514,10 @@ class JointCalibration:
         draws = replace(
             self.draws, t=t, log_prob=own, report=report, mode=middle, log_evidence=np.nan
         )
-        return Calibration(part.problem, draws, self.seed, label, (), self.settings)
+        joint = f"{', '.join(self.problem.outputs)}"
+        if self.problem.groups:
+            joint += f" in {len(self.problem.groups)} groups"
+        return Calibration(part.problem, draws, self.seed, label, (), self.settings, joint)
 
     @property
     def outputs(self) -> Mapping[str, Calibration]:
@@ -568,8 +572,9 @@ def calibrate_joint(
     Examples
     --------
     >>> import calib
-    >>> joint = calib.build_joint({"bekker": calib.load_he2019("rut_depth")})
-    >>> calib.calibrate_joint(joint, seed=1).converged
+    >>> from calib.inference.joint import build_joint, calibrate_joint
+    >>> joint = build_joint({"bekker": calib.load_he2019("rut_depth")})
+    >>> calibrate_joint(joint, seed=1).converged
     True
     """
     if problem.groups:

@@ -145,6 +145,12 @@ def test_a_group_is_saved_and_read_as_a_run(pooled: JointCalibration, tmp_path) 
     at = pd.DataFrame({"slip_ratio": [0.2]})
     one, other = (calib.predict(c, at).predictive.median for c in (group, again))
     assert one == pytest.approx(other, rel=1e-9)
+    # What was sampled together is not sampled again alone.
+    found = calib.check(tmp_path / "run")
+    assert {i.status.value for i in found.items} <= {"identical", "not judged"}
+    assert any(
+        "part of a joint posterior (drawbar_pull in 8 groups)" in i.note for i in found.items
+    )
 
 
 def two_outputs(seed: int = 5) -> pd.DataFrame:
