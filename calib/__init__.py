@@ -149,6 +149,7 @@ _UNLISTED = [
     "read_plan",
     "run_audit",
     "run_campaign",
+    "suggest_mapping",
     "table_from_arrays",
 ]
 

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from calib.errors import FAULTS, CalibError
 
 # What reads files that are none of calib's own.
-IMPORT = "have it read as it is: calib import {source} --out my.csv"
+IMPORT = "have it read as it is: calib import {source} --out imported.csv"
 
 
 @dataclass(frozen=True)

@@ -264,8 +264,8 @@ def _side_by_side(given: Mapping[str, list[tuple[int, str]]], where: str) -> Cal
         expected="one column per quantity",
         hint="of one reading in several units, delete or rename one; of repeats side by side, "
         "write each reading in a row of its own, below one another, with the conditions of its "
-        "row copied and the number of the repeat in a column 'repeat': `calib import FILE --out "
-        "my.csv` does so",
+        "row copied and the number of the repeat in a column 'repeat': calib import FILE --out "
+        "imported.csv does so",
     )
 
 

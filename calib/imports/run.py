@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.arguments import takes
 from calib.data.files import plain_number
 from calib.data.quantities import OUTPUTS, UNITS, convert
 from calib.data.reader import table_from_arrays
@@ -135,6 +137,7 @@ class Imported(Shown):
     lines: NDArray[np.int64]
 
 
+@takes(path=PathLike, mapping=(PathLike, Mapping))
 def read_log(
     path: str | os.PathLike[str], mapping: str | os.PathLike[str] | Mapping[str, Any]
 ) -> Imported:

@@ -9,10 +9,12 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from os import PathLike
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.arguments import takes
 from calib.data.quantities import QUANTITIES, UNITS, Quantity
 from calib.data.table import CHECKED, normal, parse_header
 from calib.errors import CalibError
@@ -21,6 +23,7 @@ from calib.imports.run import apply
 from calib.imports.tables import _NAMES, RawTable, is_unit, read_raw
 
 
+@takes(path=PathLike, sheet=str)
 def suggest_mapping(path: str | os.PathLike[str], *, sheet: str = "") -> str:
     r"""Suggest which column of a file is what, by names usual in the field and the tyre world.
 

@@ -75,4 +75,4 @@ def test_a_file_is_not_replaced_by_what_is_read_of_it(calib: Calib) -> None:
 def test_commands_that_refuse_a_rig_s_file_say_what_reads_it(calib: Calib, text: str) -> None:
     write(Path("rig.csv"), text)
     ran = calib("fit", "rig.csv", "--model", "magic_formula", "--out", "run")
-    assert_refused(ran, ["calib import", "--out my.csv"])
+    assert_refused(ran, ["calib import", "--out imported.csv"])
