@@ -145,10 +145,11 @@ class Tree:
             ),
             "python -c 'import calib'": Command(["-c", "import calib"]),
             "calib --help": Command([*_CALIB, "--help"]),
-            # An earlier commit has no such command, and ends with 2.
+            # Where there is no such command yet, it ends with 2.
             "calib import, 100,000 rows of 8 columns": Command(
                 [*_CALIB, "import", *_log(self.scratch), "--overwrite",
-                 "--out", f"{self.scratch}/imported.csv"], asked=5.0, ends=(0, 2),
+                 "--out", f"{self.scratch}/imported.csv"], asked=5.0,
+                ends=(0,) if (self.root / "calib" / "imports").is_dir() else (2,),
             ),
             "calib fit": Command(
                 [*_CALIB, "fit", pulls, "--model", "magic_formula_pressure", "--hold-out",
@@ -174,7 +175,7 @@ class Tree:
 
 
 def _log(folder: Path) -> list[str]:
-    """Write a sweep of slip with correlated noise as a rig does; return what `calib import` takes."""
+    """Write a noisy sweep of slip as a rig does; return what `calib import` takes."""
     import numpy as np
 
     n, rng = 100_000, np.random.default_rng(SEED)

@@ -82,11 +82,11 @@ class Report:
         """What to do if the rows that are written are not independent; empty if they are."""
         if self.apart <= self.every:
             return ""
+        done = {"bins": f"means of {self.every} are", "thinning": f"one of {self.every} is"}
         return (
-            f"the rows are not independent: only those {self.apart} apart are, and here "
-            f"{self.every if self.reduced_by else 'all'} "
-            f'{"make a row" if self.reduced_by else "are written"}; thin (every = "auto" in '
-            "[thin]), use wider bins, or write correlated_along in the prior file"
+            f"neighbouring rows are alike: independent ones are {self.apart} apart, and "
+            f'{done.get(self.reduced_by, "all are")} written: thin (every = "auto" in [thin]), use '
+            "wider bins, or write correlated_along in the prior file"
         )
 
     def lines(self) -> Iterator[str]:

@@ -122,7 +122,7 @@ def _proposals(raw: RawTable) -> Iterator[tuple[str, _Proposal]]:
     """Yield what to write and where it comes from, in the order of the file."""
     given: dict[str, str] = {}
     for columns in _side_by_side(raw):
-        unit = _unit_of(raw, columns[0])
+        unit = raw.units.get(columns[0], "")
         name = columns[0] if len(columns) == 1 else re.sub(r"\d+", "", columns[0])
         meanings = [m for m in _meanings(name, unit) if m.quantity.canonical not in given]
         if meanings:
@@ -191,13 +191,13 @@ def _slip_of_speeds(raw: RawTable, speed: str) -> Iterator[tuple[str, _Proposal]
     for entry in _NAMES["inputs"]:
         kind, wanted = INPUTS[entry["input"]]
         named = (str(n) for k in entry["names"] for n in raw.frame if _words(str(n)) == k)
-        fits = (n for n in named if _measures(_unit_of(raw, n), UNITS.get(kind, {}), wanted))
+        fits = (n for n in named if _measures(raw.units.get(n, ""), UNITS.get(kind, {}), wanted))
         if name := next(fits, ""):
             inputs[entry["input"]] = name
     if "wheel_speed" not in inputs:
         return
     said = {
-        key: _table({"from": _text(name), "unit": _text(_unit_of(raw, name))})
+        key: _table({"from": _text(name), "unit": _text(raw.units.get(name, ""))})
         for key, name in inputs.items()
     }
     remark = "1 - v/(ωr), with the rolling radius"
@@ -214,16 +214,6 @@ def _side_by_side(raw: RawTable) -> list[tuple[str, ...]]:
     for name in map(str, raw.frame):
         groups.setdefault(re.sub(r"\d+", "#", name), []).append(name)
     return [tuple(columns) for columns in groups.values()]
-
-
-def _unit_of(raw: RawTable, name: str) -> str:
-    """Return the unit that the file gives a column, at the end of its name too: ``fx_kn``."""
-    with suppress(CalibError):
-        column = parse_header(name)
-        if column is not None and name not in raw.units:
-            units = column.quantity.units.items()
-            return next((suffix for suffix, unit in units if unit == column.unit), "")
-    return raw.units.get(name, "")
 
 
 def _words(name: str) -> str:

@@ -24,7 +24,7 @@ import numpy as np
 
 from calib.data.files import decoded, number_in, writable
 from calib.data.quantities import UNITS
-from calib.data.table import CHECKED, normal
+from calib.data.table import CHECKED, normal, parse_header
 from calib.errors import CalibError
 
 if TYPE_CHECKING:
@@ -227,7 +227,7 @@ def _layout(rows: Sequence[Sequence[str]], notes: list[str]) -> _Layout:
     while cells and not cells[-1]:
         cells.pop()
     names = _unique(cells)
-    units = {name: unit for name in names if (unit := _bracketed(name))}
+    units = {name: unit for name in names if (unit := _unit_in(name))}
     units |= {n: u.strip("[]()<>") for n, u in zip(names, below, strict=False) if u.strip("[]()<>")}
     return _Layout(names, units, first, line)
 
@@ -241,11 +241,15 @@ def _unique(cells: Sequence[str]) -> list[str]:
     return names
 
 
-def _bracketed(name: str) -> str:
-    """Return the unit at the end of a name: in brackets, behind a stroke or an underscore."""
+def _unit_in(name: str) -> str:
+    """Return the unit that a name ends in: in brackets, behind a stroke or an underscore."""
     bare = re.sub(rf"\s*{re.escape(CHECKED)}\s*$", "", name, flags=re.IGNORECASE)
     if found := re.search(r"[\[(<]([^\])>]*)[\])>]\s*$", bare):
         return found[1].strip()
+    with suppress(CalibError):
+        if (column := parse_header(name)) is not None:
+            units = column.quantity.units.items()
+            return next((suffix for suffix, unit in units if unit == column.unit), "")
     found = re.search(r"(?: / |_)([^\s_]+)$", bare)
     return found[1] if found and is_unit(found[1]) else ""
 
@@ -357,7 +361,7 @@ def _parquet(raw: bytes, sheet: str) -> RawTable:
     frame = pd.read_parquet(io.BytesIO(raw)).reset_index(drop=True)
     frame.columns = pd.Index(_unique([str(name) for name in frame.columns]))
     frame.index = pd.Index(frame.index + 1, name="row")
-    return RawTable(frame, {name: unit for name in frame if (unit := _bracketed(str(name)))})
+    return RawTable(frame, {name: unit for name in frame if (unit := _unit_in(str(name)))})
 
 
 _READERS: Mapping[str, Callable[[bytes, str], RawTable]] = {

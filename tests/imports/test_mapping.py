@@ -98,6 +98,7 @@ def test_the_channels_of_the_tyre_test_consortium_are_known(tmp_path: Path) -> N
     ("head", "columns"),
     [
         ("slip_percent,drawbar_pull_n (checked)", {"slip_percent", "drawbar_pull_n (checked)"}),
+        ("speed_m_s,Cone index [MPa]", {"speed_m_s", "cone_index_mpa"}),
         ("Longitudinal slip [%],DP [kN]", {"slip_percent", "drawbar_pull_kn"}),
         ("P [kW],T [s]", set()),  # power and time, not pressure and torque
         ("Fx_kN,Load cell Z / kN", {"drawbar_pull_kn", "normal_load_kn"}),

@@ -110,7 +110,7 @@ def test_a_run_is_thinned_to_independent_rows() -> None:
     assert abs(np.corrcoef(left[1:], left[:-1])[0, 1]) < 4.0 / np.sqrt(len(left))
     assert not log.report.warning
     again = made({**mapping, "thin": {"every": 2}}, drawbar_pull_kn=ar1(n, rho), run=half)
-    assert "not independent" in again.report.warning
+    assert "neighbouring rows are alike" in again.report.warning
 
 
 def test_thinning_is_suggested_where_rows_are_alike(tmp_path: Path) -> None:
