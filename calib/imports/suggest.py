@@ -63,7 +63,7 @@ def suggest(raw: RawTable) -> str:
     found = dict(_proposals(raw))
     if not found:
         raise CalibError(
-            "no column is known by its name",
+            f"no column is known by its name: {', '.join(map(str, raw.frame))}",
             where=raw.source,
             expected="a quantity, as `calib quantities` lists them, or a usual name of one",
             hint="write a mapping: [columns] drawbar_pull_kn = "

@@ -16,6 +16,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
@@ -200,23 +201,27 @@ def _layout(rows: Sequence[Sequence[str]], notes: list[str]) -> _Layout:
     for row, count in zip(rows, counts, strict=True):
         widths[len(row)] += count
     width = max(widths, key=widths.__getitem__, default=0)
-    usual = [c for row, c in zip(rows, counts, strict=True) if len(row) == width and c]
-    # In a block above the names few cells are numbers, in some rows cells are empty.
-    data = (
-        i
-        for i, row in enumerate(rows)
-        if usual and len(row) == width and 2 * counts[i] > median(usual)
-    )
-    first = next(data, None)
-    above = [i for i in range(first or 0) if any(rows[i])]
-    if first is None or not above:
-        found = "there are no rows of numbers" if first is None else "no line names the columns"
+    there = [i for i, row in enumerate(rows) if any(row)]
+    usual = [counts[i] for i in there if len(rows[i]) == width and counts[i]]
+    # In a block above the names few cells are numbers, in some rows of data cells are empty.
+    data = {i for i in there if len(rows[i]) == width and 2 * counts[i] > median(usual or [1])}
+
+    def heads(i: int) -> bool:
+        words = list(filter(None, rows[i]))
+        return not counts[i] and (2 * len(words) > width or all(map(is_unit, words)))
+
+    # Loggers write tables about the channels first, so the last names count; repeated ones are no
+    # new table, and a text in the only column is no name.
+    starts = [(k, i) for k, i in pairwise(there) if i in data and k not in data and heads(k)]
+    if not starts:
         raise CalibError(
-            found,
+            "no line names the columns" if data else "there are no rows of numbers",
             expected="a line of column names, one of units if there is one, then rows of numbers",
             hint="write the names of the columns, separated as the numbers are, above them",
         )
-    line = above.pop()
+    last = rows[starts[-1 if width > 1 else 0][0]]
+    line, first = next((k, i) for k, i in starts if rows[k] == last)
+    above = [i for i in there if i < line]
     below: Sequence[str] = ()
     if above and len(rows[above[-1]]) > 1 and all(map(is_unit, filter(None, rows[line]))):
         below, line = rows[line], above.pop()

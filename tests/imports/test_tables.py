@@ -57,6 +57,28 @@ def test_names_and_units_stand_in_lines_of_their_own(tmp_path: Path) -> None:
     assert raw.frame.index.tolist() == [4, 5]
 
 
+CHANNELS = """\
+Channels\t2
+Samples\t3\t3
+X_Dimension\tTime\tTime
+X0\t0.0\t0.0
+***End_of_Header***
+Slip [%]\tPull [N]\tComment
+2.5\t410.5\tok
+10\t930
+"""
+
+
+def test_tables_of_channels_stand_above_the_names(tmp_path: Path) -> None:
+    raw = read_raw(write(tmp_path / "a.lvm", CHANNELS.replace("930", "930\t")))
+    assert raw.frame["Pull [N]"].tolist() == [410.5, 930]
+
+
+def test_names_that_are_repeated_begin_no_new_table(tmp_path: Path) -> None:
+    raw = read_raw(write(tmp_path / "a.csv", f"{PLAIN}pause,\n{PLAIN}"))
+    assert len(raw.frame) == 6
+
+
 def test_text_beside_numbers_is_kept(tmp_path: Path) -> None:
     raw = read_raw(write(tmp_path / "a.csv", "who,slip,who\nAnn,5,a\nBob,,b\n"))
     assert raw.frame["who"].tolist() == ["Ann", "Bob"]
@@ -152,7 +174,7 @@ def test_units_as_rigs_write_them(unit: str) -> None:
         ("a.csv", b"1,2\n3,4\n", ["no line names the columns"]),
         ("a.csv", b"only words\nand more\n", ["no rows of numbers"]),
         ("a.csv", b"a;b;c\n1;2;3\n4;5\n", ["line 3", "2 cells", "a, b, c"]),
-        ("a.csv", b"a,b\n1,2\n1,2,3\n", ["line 3", "3 cells"]),
+        ("a.csv", b"a,b\n1,2\n3,4\n1,2,3\n", ["line 4", "3 cells"]),
         ("a.csv", b"PK\x03\x04\x00\x00", ["binary"]),
         ("a.xlsx", b"not a workbook", ["damaged or not what its name says"]),
         ("a.mat", b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM", ["-v7"]),
