@@ -166,12 +166,13 @@ def _text(raw: bytes, sheet: str) -> RawTable:
 
     # Of equals the comma comes last: 1,5;2,5 has as many numbers between commas.
     delimiter = max((";", "\t", "|", "", ","), key=numbers)
-    layout = _layout([_split(line, delimiter) for line in head], notes)
+    rows = [_split(line, delimiter) for line in head]
+    layout = _layout(rows, notes)
     body = ["" if _COMMENT.match(line) else line for line in lines[layout.first :]]
-    cells = " ".join(head[layout.first :])
-    commas, points = (len(re.findall(rf"\d\{sign}\d", cells)) for sign in ",.")
-    decimal = "," if delimiter != "," and commas > points else "."
-    if decimal == ",":
+    cells = [cell for row in rows[layout.first :] for cell in row if _is_number(cell)]
+    commas = sum("," in cell for cell in cells) > sum("." in cell for cell in cells)
+    decimal = "," if commas else "."
+    if commas:
         notes.append("numbers have a decimal comma")
     names = [*layout.names, *[f"column {k}" for k in range(_extra_cells(body, delimiter, layout))]]
     frame = pd.read_csv(

@@ -71,4 +71,5 @@ def _points(
 
 
 def _label(column: Column) -> str:
-    return f"{column.quantity.title} ({column.unit_word or '1'})"
+    unit = column.unit_word.replace("percent", "%").replace("degree", "°").replace("degC", "°C")
+    return f"{column.quantity.title} ({unit})" if unit else column.quantity.title
