@@ -145,6 +145,12 @@ class Tree:
             ),
             "python -c 'import calib'": Command(["-c", "import calib"]),
             "calib --help": Command([*_CALIB, "--help"]),
+            # Where there is no such command yet, it ends with 2.
+            "calib import, 100,000 rows of 8 columns": Command(
+                [*_CALIB, "import", *_log(self.scratch), "--overwrite",
+                 "--out", f"{self.scratch}/imported.csv"], asked=5.0,
+                ends=(0,) if (self.root / "calib" / "imports").is_dir() else (2,),
+            ),
             "calib fit": Command(
                 [*_CALIB, "fit", pulls, "--model", "magic_formula_pressure", "--hold-out",
                  "inflation_pressure_psi=30", "--out", run, "--overwrite"],
@@ -166,6 +172,24 @@ class Tree:
     def makefile(self) -> str:
         """Return its Makefile."""
         return (self.root / "Makefile").read_text()
+
+
+def _log(folder: Path) -> list[str]:
+    """Write a noisy sweep of slip as a rig does; return what `calib import` takes."""
+    import numpy as np
+
+    n, rng = 100_000, np.random.default_rng(SEED)
+    slip = 25.0 - 25.0 * np.cos(np.arange(n) / 1000.0)
+    noise = np.convolve(rng.standard_normal(n + 9), np.ones(10), "valid")
+    columns = {"slip_percent": slip, "drawbar_pull_n": 3e3 * np.tanh(slip / 10.0) + 10.0 * noise}
+    columns |= {"normal_load_n": rng.normal(4e3, 10.0, n), "speed_m_s": rng.normal(1.0, 0.01, n)}
+    columns |= {"inflation_pressure_kpa": rng.normal(180.0, 1.0, n)}
+    mapping = "".join(f'{name} = {{from = "{name}"}}\n' for name in columns)
+    columns |= {name: rng.normal(0.0, 10.0, n) for name in ("FY", "MX", "MZ")}
+    path, table = folder / "run.csv", np.column_stack([*columns.values()])
+    np.savetxt(path, table, "%.4f", ",", header=",".join(columns))
+    path.with_suffix(".toml").write_text(f'[columns]\n{mapping}[thin]\nevery = "auto"\n')
+    return [str(path), "--mapping", str(path.with_suffix(".toml"))]
 
 
 _MEASURED = ("clock", "processor", "exit_codes")

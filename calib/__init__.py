@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from calib.gap.predict import predict
     from calib.he2019.audit import Audit, run_audit
     from calib.he2019.embedded import load_he2019
+    from calib.imports import Imported, read_log, suggest_mapping
     from calib.inference.calibration import Calibration, calibrate
     from calib.inference.emulation import Emulation
     from calib.inference.emulation.prepared import emulated
@@ -50,6 +51,7 @@ _HOME = {
     "calib.gap.predict": "predict",
     "calib.he2019.audit": "Audit run_audit",
     "calib.he2019.embedded": "load_he2019",
+    "calib.imports": "Imported read_log suggest_mapping",
     "calib.inference.calibration": "Calibration calibrate",
     "calib.inference.emulation": "Emulation",
     "calib.inference.emulation.prepared": "emulated",
@@ -77,6 +79,7 @@ __all__ = [
     "Diagnosis",
     "Effect",
     "Emulation",
+    "Imported",
     "Model",
     "PointEstimate",
     "Prediction",
@@ -102,6 +105,7 @@ __all__ = [
     "load_he2019",
     "predict",
     "read_case",
+    "read_log",
     "read_plan",
     "read_simulator",
     "read_table",
@@ -109,6 +113,7 @@ __all__ = [
     "run_audit",
     "run_campaign",
     "save_calibration",
+    "suggest_mapping",
     "table_from_arrays",
     "to_datatree",
     "validate_held_out",
@@ -133,6 +138,7 @@ _UNLISTED = [
     "Comparison",
     "Diagnosis",
     "Emulation",
+    "Imported",
     "PointEstimate",
     "Prediction",
     "Problem",
@@ -143,6 +149,7 @@ _UNLISTED = [
     "read_plan",
     "run_audit",
     "run_campaign",
+    "suggest_mapping",
     "table_from_arrays",
 ]
 

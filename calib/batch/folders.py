@@ -361,12 +361,12 @@ def read_folder(folder: Path) -> dict[str, bytes]:
     }
 
 
-def write_whole(path: Path, text: str) -> None:
+def write_whole(path: Path, content: str | bytes) -> None:
     """Write a file that is there whole or not at all, or as it was, whenever it is killed."""
     # Of a name of its own, for another process may write the same.
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        part.write_text(text, encoding="utf-8")
+        part.write_bytes(content if isinstance(content, bytes) else content.encode())
         part.replace(path)
     finally:
         with suppress(OSError):

@@ -17,6 +17,7 @@ from calib.cli import (
     campaign,
     check,
     declared,
+    imports,
     interrupted,
     options,
     prediction,
@@ -80,6 +81,7 @@ app = typer.Typer(
 # Commands with an example each, in groups as the help shows them.
 _COMMANDS: Mapping[str, Mapping[Callable[..., None], str]] = {
     "Everyday": {
+        imports.import_: "import run7.xlsx --out my.csv",
         calibration.fit: "fit my.csv --model magic_formula_pressure --out run",
         prediction.predict: "predict run --at conditions.csv --out predicted.csv",
         calibration.report: "report my.csv --hold-out inflation_pressure_psi=30 --out report",
@@ -107,9 +109,10 @@ _COMMANDS: Mapping[str, Mapping[Callable[..., None], str]] = {
 }
 for panel, commands in _COMMANDS.items():
     for command, example in commands.items():
-        app.command(cls=options.Command, rich_help_panel=panel, epilog=f"Example: calib {example}")(
-            command
-        )
+        app.command(
+            command.__name__.rstrip("_"),  # `import` is a word of Python
+            cls=options.Command, rich_help_panel=panel, epilog=f"Example: calib {example}",
+        )(command)  # fmt: skip
 app.add_typer(campaign.challenge, name="challenge", rich_help_panel=panel)
 
 

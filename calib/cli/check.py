@@ -231,6 +231,7 @@ def doctor(
     extras = {
         "dashboard": ("bokeh", "Dask's page of what the workers do"),
         "docs": ("sphinx", "the documentation of a checkout"),
+        "import": ("python-calamine", "workbooks and Parquet for `calib import`"),
         "test": ("pytest", "the tests of a checkout"),
     }
     optional = {extra: installed(package) for extra, (package, _) in extras.items()}

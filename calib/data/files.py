@@ -22,6 +22,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib.errors import FAULTS, CalibError
 
+# What reads files that are none of calib's own.
+IMPORT = "have it read as it is: calib import {source} --out imported.csv"
+
 
 @dataclass(frozen=True)
 class CsvFile:
@@ -87,7 +90,8 @@ def _read_bytes(source: str) -> bytes:
 
 
 def _decode(raw: bytes, source: str) -> str:
-    hint = "save it again as CSV in UTF-8 (Excel: `CSV UTF-8`)"
+    hint = "save it again as CSV in UTF-8 (Excel: `CSV UTF-8`), or "
+    hint += IMPORT.format(source=source)
     try:
         text = decoded(raw)
     except UnicodeDecodeError as error:

@@ -23,10 +23,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib.arguments import takes
-from calib.data.files import CsvFile, number_in, open_csv, with_points
-from calib.data.quantities import OUTPUTS, QUANTITIES
+from calib.data.files import IMPORT, CsvFile, number_in, open_csv, with_points
+from calib.data.quantities import OUTPUTS, QUANTITIES, UNITS
 from calib.data.registry import Registry
-from calib.data.table import CHECKED, MAX_TEXT_ROWS, Column, Table, match_headers, names_quantity
+from calib.data.table import (
+    CHECKED,
+    MAX_TEXT_ROWS,
+    Column,
+    Table,
+    match_headers,
+    names_quantity,
+    normal,
+)
 from calib.errors import CalibError
 
 type Array = NDArray[np.float64]
@@ -138,7 +146,7 @@ def _raise_any(problems: Sequence[Fault], source: str, place: str = "line") -> N
 
 
 def _check_first_line(file: CsvFile, where: str) -> None:
-    """Refuse a file whose column names stand below other lines, of which instruments write some."""
+    """Refuse a file with other lines above the column names, or units in the line below them."""
     # The separator was taken from the first line, so other lines may have another.
     named = {
         line: sum(map(names_quantity, re.split("[,;\t]", ",".join(row))))
@@ -150,7 +158,15 @@ def _check_first_line(file: CsvFile, where: str) -> None:
             f"the first line, {','.join(file.header)!r}, names fewer quantities than line {line}",
             where=where,
             expected="the line of column names first, then one line per row",
-            hint=f"delete what stands above line {line}",
+            hint=f"delete what stands above line {line}, or {IMPORT.format(source=file.source)}",
+        )
+    line, cells = file.rows[0] if file.rows else (0, [])
+    if any(normal(cell) in units for cell in cells for units in UNITS.values()):
+        raise CalibError(
+            f"the line below the column names, {','.join(cells)!r}, holds units",
+            where=f"{file.source}, line {line}",
+            expected="units in the column names, such as slip_percent or Rut depth [mm]",
+            hint=f"write them there and delete the line, or {IMPORT.format(source=file.source)}",
         )
 
 
@@ -449,6 +465,8 @@ def table_from_arrays(
     label: str = "",
     required: Sequence[str] = (),
     allow_missing: Collection[str] = (),
+    lines: Sequence[int] | NDArray[np.int64] | None = None,
+    place: str = "row",
 ) -> Table:
     """Make a table of arrays, with the checks of a file.
 
@@ -460,6 +478,10 @@ def table_from_arrays(
         Names for messages and for whoever shows the table.
     required, allow_missing
         As for `read_table`.
+    lines : sequence of int, shape (n,), optional
+        Where each row stands in what it was taken from; from 0 by default.
+    place : str
+        What messages call that.
 
     Returns
     -------
@@ -479,7 +501,8 @@ def table_from_arrays(
     [0.4, 0.934]
     """
     arrays = {name: np.asarray(values) for name, values in columns.items()}
-    rows = range(_common_length(arrays, source))
+    n = _common_length(arrays, source)
+    rows = range(n) if lines is None else [int(line) for line in lines]
     matched, ignored = match_headers(tuple(arrays), where=source, required=required)
     for column in matched:
         kind = arrays[column.header].dtype
@@ -494,7 +517,7 @@ def table_from_arrays(
             )
     header = tuple(arrays)
     values, problems = _checked(matched, [*arrays.values()], rows, required, allow_missing)
-    _raise_any(problems, source, "row")
+    _raise_any(problems, source, place)
     digest = hashlib.sha256()
     for name in sorted(values):
         digest.update(f"{name}\0".encode())

@@ -81,7 +81,7 @@ def accepted_headers(quantity: Quantity) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-def _normal(header: str) -> str:
+def normal(header: str) -> str:
     """Bring a header to lower case words joined by underscores, without `CHECKED`."""
     text = header.lower().rstrip().removesuffix(CHECKED)
     text = text.replace("%", " percent ").replace("³", "3").replace("²", "2")
@@ -110,7 +110,7 @@ def parse_header(header: str, *, where: str = "", position: int = 0) -> Column |
     CalibError
         If a quantity is named without its unit, or with an unknown or an unfitting one.
     """
-    name = _normal(header)
+    name = normal(header)
     named = _named(name)
     if named is None:
         return None
@@ -125,7 +125,7 @@ def parse_header(header: str, *, where: str = "", position: int = 0) -> Column |
 
 def names_quantity(header: str) -> bool:
     """Whether a column name begins with a quantity, whatever its unit."""
-    return _named(_normal(header)) is not None
+    return _named(normal(header)) is not None
 
 
 def _named(name: str) -> tuple[Quantity, str] | None:
@@ -220,7 +220,7 @@ def match_headers(
     ignored: list[str] = []
     errors: dict[str, CalibError] = {}
     for position, header in enumerate(headers):
-        quantity, suffix = _named(_normal(header)) or (None, "")
+        quantity, suffix = _named(normal(header)) or (None, "")
         try:
             column = parse_header(header, position=position)
         except CalibError as error:
@@ -265,7 +265,8 @@ def _side_by_side(given: Mapping[str, list[tuple[int, str]]], where: str) -> Cal
         expected="one column per quantity",
         hint="of one reading in several units, delete or rename one; of repeats side by side, "
         "write each reading in a row of its own, below one another, with the conditions of its "
-        "row copied and the number of the repeat in a column 'repeat'",
+        "row copied and the number of the repeat in a column 'repeat': calib import FILE --out "
+        "imported.csv does so",
     )
 
 
@@ -282,7 +283,7 @@ def missing_columns(
         f"; {header!r} is read as derived from the {of[0].word}, unless it is renamed to the "
         "quantity and its unit alone"
         for header in ignored
-        if (of := _named(_normal(header))) and of[0] in wanted
+        if (of := _named(normal(header))) and of[0] in wanted
     )
     return CalibError(
         f"there is no column for {', '.join(q.stem for q in wanted)}; "
@@ -324,7 +325,7 @@ def columns_meant(
 
 
 def _guess(header: str, known: Mapping[str, Quantity], cutoff: float, shortened: bool) -> str:
-    name = _normal(header)
+    name = normal(header)
     named = _named(name)
     if named is not None and _is_about(named[1], named[0]):
         # Renamed, an uncertainty or a limit would be taken for the reading.

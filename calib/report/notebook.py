@@ -17,10 +17,12 @@ from calib.gap.corrected import CorrectedPrediction
 from calib.gap.describe import gap_document
 from calib.gap.diagnose import Diagnosis
 from calib.gap.mixture import UNLISTED
+from calib.imports import Imported
 from calib.inference.calibration import Calibration
 from calib.inference.random import generator
 from calib.report.comparison import comparison_figure
 from calib.report.figures import bands, gap, style
+from calib.report.figures.imported import imported_figure
 from calib.report.gap_words import Words
 from calib.report.labels import axis_of, parameter_unit, units_of
 from calib.report.rows import Fitted
@@ -39,6 +41,11 @@ def frame(found: Any) -> pd.DataFrame:
 @frame.register
 def _(found: Table) -> pd.DataFrame:
     return pd.DataFrame(dict(found.columns), index=pd.Index(found.lines, name="line"))
+
+
+@frame.register
+def _(found: Imported) -> pd.DataFrame:
+    return pd.DataFrame(dict(found.columns), index=pd.Index(found.table.lines, name="line"))
 
 
 @frame.register
@@ -105,6 +112,11 @@ def _(found: Diagnosis) -> pd.DataFrame:
 def figure(found: Any) -> Figure:
     """Draw the one figure that shows a result."""
     raise TypeError(f"{type(found).__name__} has no figure")
+
+
+@figure.register
+def _(found: Imported) -> Figure:
+    return imported_figure(found)
 
 
 @figure.register

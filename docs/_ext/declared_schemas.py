@@ -8,6 +8,7 @@ from result_schemas import RESULTS
 
 from calib.batch.campaign.kinds import KINDS
 from calib.checking.check import Manifest
+from calib.imports.mapping import Mapped
 from calib.inference.io import RunRecord
 from calib.inference.prior_files import PriorFileContent
 from calib.models.simulators.files import SimulatorFile
@@ -18,6 +19,7 @@ def schemas() -> dict[str, dict[str, Any]]:
     """Return the schemas by the names of their files."""
     return {
         "priors": PriorFileContent.model_json_schema(),
+        "mapping": Mapped.model_json_schema(),
         "plan": _plan(),
         "simulator": SimulatorFile.model_json_schema(),
         "manifest": _without_document(Manifest.model_json_schema()),

@@ -20,6 +20,7 @@ from pydantic import BaseModel, ValidationError
 
 from calib.data.quantities import QUANTITIES
 from calib.gap.effects import View
+from calib.imports.mapping import DERIVED, INPUTS, Mapped, Source
 from calib.inference.io import RunRecord
 from calib.inference.sampler import SamplerSettings
 from calib.models import example_csv
@@ -156,6 +157,14 @@ def test_every_key_of_a_simulator_file_is_told_with_its_default() -> None:
         if isinstance(field.default, (str, int, float, bool)) and name != "cache"
     }
     assert {name: told[name] for name in plain} == plain
+
+
+def test_every_key_of_a_mapping_is_told() -> None:
+    page = (DOCS / "formats" / "inputs.md").read_text(encoding="utf-8")
+    section = page.partition("\n## mapping.toml\n")[2].partition("\n## ")[0]
+    told = set(re.findall(r"`\[?(\w+)\]?", section)) | {"sheet"}
+    fields = {*Mapped.model_fields, *Source.model_fields, *DERIVED, *INPUTS} - {"from_"}
+    assert fields <= told
 
 
 def test_every_role_of_an_effect_is_told_with_its_column() -> None:
