@@ -516,7 +516,9 @@ def _check_names(
 ) -> None:  # fmt: skip
     if content.get("model") != model_name:
         raise CalibError(
-            f"the priors are for model {content.get('model')!r}, not {model_name!r}",
+            f"the priors are for model {content.get('model')!r}, not {model_name!r}"
+            if "model" in content
+            else "the file does not say for which model its priors are",
             where=source,
             expected=f'model = "{model_name}"',
             hint="pass the prior file of this model",
