@@ -506,7 +506,7 @@ def table_from_arrays(
     matched, ignored = match_headers(tuple(arrays), where=source, required=required)
     for column in matched:
         kind = arrays[column.header].dtype
-        if column.quantity.kind != "label" and kind.kind not in "fiub":
+        if column.quantity.kind != "label" and kind.kind not in "fiu":
             odd = next((i for i, v in enumerate(arrays[column.header]) if _is_text(v)), None)
             raise CalibError(
                 f"the values are of type {kind}, not numbers"
@@ -568,7 +568,8 @@ def as_table(data: Tabular, *, allow_missing: Sequence[str] = ()) -> Table:
             expected="each column once",
             hint="drop one of them",
         )
-    return table_from_arrays(dict(pairs), allow_missing=allow_missing)
+    table = table_from_arrays(dict(pairs), allow_missing=allow_missing)
+    return replace(table, index=index_of(data) or ())
 
 
 def _is_text(value: object) -> bool:
@@ -580,7 +581,9 @@ def _is_text(value: object) -> bool:
 
 
 def index_of(data: object) -> tuple[object, ...] | None:
-    """Return the labels of a data frame's rows; None of anything else."""
+    """Return the labels of a data frame's rows, or of a table made of one; None of others."""
+    if isinstance(data, Table):
+        return data.index or None
     return tuple(data.index) if hasattr(data, "iloc") and hasattr(data, "index") else None
 
 

@@ -373,6 +373,8 @@ class Table(Shown):
         Column names that name no known quantity.
     extra : mapping of str to tuple of str
         The cells of these; empty where `text` is.
+    index : tuple
+        Labels of the rows in the data frame that was given; empty of other sources.
     """
 
     columns: Mapping[str, NDArray[np.float64]]
@@ -384,6 +386,7 @@ class Table(Shown):
     label: str = ""
     ignored: tuple[str, ...] = ()
     extra: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    index: tuple[object, ...] = ()
 
     def __post_init__(self) -> None:
         frozen = {name: np.array(values, dtype=np.float64) for name, values in self.columns.items()}
@@ -397,7 +400,7 @@ class Table(Shown):
         # A mapping proxy does not pickle, and worker processes are handed tables.
         return Table, (
             dict(self.columns), self.source, self.lines, self.header, self.text, self.sha256,
-            self.label, self.ignored, self.extra,
+            self.label, self.ignored, self.extra, self.index,
         )  # fmt: skip
 
     def __repr__(self) -> str:
@@ -504,6 +507,7 @@ class Table(Shown):
             lines=self.lines[index],
             text=tuple(self.text[i] for i in index) if self.text else (),
             extra={name: tuple(cells[i] for i in index) for name, cells in self.extra.items()},
+            index=tuple(self.index[i] for i in index) if self.index else (),
         )
 
 

@@ -95,6 +95,7 @@ def gap_document(
         outputs=_outputs(found),
         explanations=tuple(_explanation(found, n, prior[n], placebo) for n in ranking.order),
         definitions=tuple(_definitions(found)),
+        equations=_equations(found),
         track_record=doc.track_record(ranking.probability[best]),
         causes=tuple(_cause(found, n, c) for n, c in found.inclusion.causes.items()),
         remainder=_cause(found, UNLISTED, found.inclusion.residual_discrepancy),
@@ -348,6 +349,14 @@ def shifts(outputs: Sequence[OutputData], fit: Fit) -> Iterator[doc.Parameter]:
         elif prior is None:
             value, sd = 100.0 * value, 100.0 * sd
         yield doc.Parameter(output, name, unit, value, sd, "value", (value, sd))
+
+
+def _equations(found: Diagnosis) -> dict[str, tuple[str, ...]]:
+    """Return what the effects change that are not ruled out, words with mathematics."""
+    ranking = found.ranking
+    there = (name for name in ranking.order if ranking.probability[name] >= 0.01)
+    effects = (e for name in there for e in ranking.best(name).forward.hypothesis.effects)
+    return {e.name: e.latex for e in effects if e.latex}
 
 
 def _definitions(found: Diagnosis) -> list[doc.Definition]:

@@ -34,8 +34,8 @@ type Form = Literal["drift", "step", "both", "neither"]
 
 # What the cases are, which is not what a user has.
 BENCH = (
-    "the bench is calib's own, its mechanics share no formula with the diagnosis, and it has no "
-    "measured cases"
+    "these cases are synthetic and calib's own, of mechanics that share no formula with the "
+    "diagnosis; none is measured"
 )
 
 
@@ -465,6 +465,7 @@ class GapDocument:
     versions: Mapping[str, str] = field(default_factory=dict)
     remainder_where: tuple[Region, ...] = ()
     definitions: tuple[Definition, ...] = ()
+    equations: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     sizes: tuple[Size, ...] = ()
     unlisted: Unlisted | None = None
     runs: RunTrend | None = None

@@ -154,12 +154,6 @@ def _other_units(lab: Table, field: Table, models: Mapping[str, str]) -> list[st
     conditions = {name for model in models.values() for name in get_model(model).conditions}
     for name in sorted(conditions & set(lab) & set(field)):
         apart = field[name].min() > lab[name].max() or field[name].max() < lab[name].min()
-        ratio = _typical(field[name]) / max(_typical(lab[name]), 1e-300)
-        if not apart and not 1.0 / FAR_RATIO < ratio < FAR_RATIO:
-            said.append(
-                f"{_compared(lab, field, name, ROUGHLY_UNIT)}; if the field's is in another unit, "
-                "the diagnosis means nothing"
-            )
         if apart and np.ptp(lab[name]) > 0.0:
             read = usual_in(field, name, field[name], lab[name].min(), lab[name].max())
             within = f", and all would if the readings are in {read}" if read else ""
@@ -170,14 +164,6 @@ def _other_units(lab: Table, field: Table, models: Mapping[str, str]) -> list[st
             )
     said += _covariates(lab, field, conditions)
     outputs = [OUTPUTS[output] for output in models]
-    for name in outputs:
-        if name in lab and name in field:
-            ratio = _typical(field[name]) / max(_typical(lab[name]), 1e-300)
-            if not 1.0 / ODD_RATIO < ratio < ODD_RATIO:
-                said.append(
-                    f"{_compared(lab, field, name)}; if the field's is in another unit, or is "
-                    "another column's, the diagnosis means nothing"
-                )
     pull = next((name for name in outputs if role_of(name) == "pull"), None)
     for table in (lab, field):
         load = next((c for c in columns_of("load") if c in table), None)
@@ -190,6 +176,27 @@ def _other_units(lab: Table, field: Table, models: Mapping[str, str]) -> list[st
                     "the normal load, more than a tyre on soil can pull; check the columns"
                 )
     return said
+
+
+def units_in_doubt(lab: Table, field: Table, models: Mapping[str, str]) -> Iterator[Remark]:
+    """Name columns of the models that, if the field's are in another unit, make all else wrong."""
+    conditions = {name for model in models.values() for name in get_model(model).conditions}
+    outputs = [OUTPUTS[output] for output in models]
+    for name in (*sorted(conditions), *outputs):
+        if name not in lab or name not in field:
+            continue
+        apart = field[name].min() > lab[name].max() or field[name].max() < lab[name].min()
+        most, like = (ODD_RATIO, ()) if name in outputs else (FAR_RATIO, (ROUGHLY_UNIT,))
+        ratio = _typical(field[name]) / max(_typical(lab[name]), 1e-300)
+        if 1.0 / most < ratio < most or (apart and name not in outputs):
+            continue
+        or_other = ", or is another column's," if name in outputs else ","
+        yield Remark(
+            f"{_compared(lab, field, name, *like)}; if the field's is in another unit{or_other} "
+            "the diagnosis means nothing",
+            f"the field's {QUANTITIES[name].word} may be in another unit",
+            True,
+        )
 
 
 def _covariates(lab: Table, field: Table, used: Collection[str]) -> Iterator[str]:
@@ -267,17 +274,22 @@ def _times(lab: Array, field: Array, quantity: Quantity, near: float = NEAR_UNIT
 
 def doubts(data: Campaigns, ranking: Ranking) -> tuple[Remark, ...]:
     """Say what no explanation has: in a field as it says, any is said with a chance of `LEVEL`."""
-    best = ranking.best(ranking.order[0])
-    return _converged(ranking) + failed(
-        [
-            check
-            for o in data.outputs
-            for check in (
-                *_noisier(data, o, ranking.lab_mode[o.name], best),
-                *_patterns(data, o, ranking, best),
-                *_dependent(data, o, ranking.lab_mode[o.name], best),
-            )
-        ]
+    best, case = ranking.best(ranking.order[0]), data.case
+    units = tuple(units_in_doubt(case.lab, case.field, case.models))
+    return (
+        units
+        + _converged(ranking)
+        + failed(
+            [
+                check
+                for o in data.outputs
+                for check in (
+                    *_noisier(data, o, ranking.lab_mode[o.name], best),
+                    *_patterns(data, o, ranking, best),
+                    *_dependent(data, o, ranking.lab_mode[o.name], best),
+                )
+            ]
+        )
     )
 
 

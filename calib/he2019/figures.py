@@ -401,7 +401,7 @@ def _neither_campaign(before: Axes, after: Axes, rows: Table, result: FoundGap) 
         _marks(
             ax, axis_of("slip_ratio").scale(rows["slip_ratio"]),
             axis_of(column).factor * (rows[column] - values), *_mark(psi),
-            f"{psi:g} psi, in neither campaign" if ax is after else "", mfc="white", mew=0.9,
+            f"{psi:g} psi, used in neither campaign" if ax is after else "", mfc="white", mew=0.9,
             ms=4.4, zorder=2,
         )  # fmt: skip
 

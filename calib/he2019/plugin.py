@@ -35,8 +35,8 @@ class Plugin:
         some, said = (
             "Some of the data",
             "are reconstructed from published results [@He_2019], so that the published estimates "
-            "fit them best. They are not measurements: that the models fit follows from how they "
-            "were made.",
+            "fit them best. They are not measurements: that models fit them follows in part from "
+            "how they were made.",
         )
         register(
             KnownData(LABEL, "the embedded data", f"The data {said}", embedded.holds),

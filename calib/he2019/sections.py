@@ -191,7 +191,7 @@ class GapsSection(Section[tuple[FoundGap, ...]]):
 
     gaps: Sequence[PaperGap] = field(default_factory=paper_gaps)
     name, anchor, badge = "paper_gaps", "paper-gaps", "reconstructed data"
-    heading = "Where the paper's own models miss"
+    heading = "Tests of gaps in the paper's models"
 
     @classmethod
     def again(cls, record: Any) -> GapsSection:

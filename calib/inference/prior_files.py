@@ -515,8 +515,9 @@ def _check_names(
     of_noise: Sequence[str],
 ) -> None:  # fmt: skip
     if content.get("model") != model_name:
+        named = f"model {content['model']!r}" if "model" in content else "no model"
         raise CalibError(
-            f"the priors are for model {content.get('model')!r}, not {model_name!r}",
+            f"the priors are for {named}, not {model_name!r}",
             where=source,
             expected=f'model = "{model_name}"',
             hint="pass the prior file of this model",

@@ -40,7 +40,8 @@ def frame(found: Any) -> pd.DataFrame:
 
 @frame.register
 def _(found: Table) -> pd.DataFrame:
-    return pd.DataFrame(dict(found.columns), index=pd.Index(found.lines, name="line"))
+    lines = pd.Index(found.lines, name="line") if not found.index else list(found.index)
+    return pd.DataFrame(dict(found.columns), index=lines)
 
 
 @frame.register
@@ -66,7 +67,16 @@ def _(found: Prediction) -> pd.DataFrame:
 
 @frame.register
 def _(found: CorrectedPrediction) -> pd.DataFrame:
-    return pd.DataFrame(dict(found.columns), index=found.index)
+    columns = dict(found.columns)
+    return pd.DataFrame(columns, index=found.index).transform(_as_numbers)
+
+
+def _as_numbers(cells: pd.Series[Any]) -> pd.Series[Any]:
+    """Return cells as numbers, if all of them are."""
+    try:
+        return pd.to_numeric(cells)
+    except (TypeError, ValueError):
+        return cells
 
 
 @frame.register
@@ -189,7 +199,8 @@ def html(found: Any) -> str:
 @html.register
 def _(found: Calibration) -> str:
     said = verdict(found)
-    lines = [f"Trust: {said.trust}." * bool(said.trust), f"Not: {said.doubt}." * bool(said.doubt)]
+    lines = [f"Warning: {text}." for text in said.warnings]
+    lines += [f"Trust: {said.trust}." * bool(said.trust), f"Not: {said.doubt}." * bool(said.doubt)]
     problem, table = found.problem, frame(found)
     with units_of(problem.table.header):
         columns = (problem.bound.model.output, *problem.conditions)

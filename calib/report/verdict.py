@@ -32,9 +32,10 @@ from calib.report.constants import EXPECTED, WEAK_SKILL
 from calib.report.labels import axis_of, joined, units_of
 from calib.report.page.template import words
 from calib.report.rows import Fitted, held_table, signs_along, x_column
-from calib.validation.assumptions import checks_of, remarks_of
+from calib.validation.assumptions import checks_of, conflicts, remarks_of
 from calib.validation.constants import LEVEL
 from calib.validation.prediction import (
+    bias_probability,
     binomial_p,
     coverage_probability,
     effective_rows,
@@ -80,6 +81,7 @@ class Evidence:
     prior_set: Sequence[str]  # parameters whose width is the prior's
     two_pressures: bool  # whether a quadratic in pressure was calibrated at two pressures
     null_rmse: float  # of the calibrated rows' mean, which knows no condition
+    linear_rmse: float  # of a linear regression on the conditions, on the scale of the response
     sign_changes: int  # of the residuals along the curve
     neighbours: int
     along: str  # the condition that the curve runs along
@@ -98,6 +100,8 @@ class Evidence:
     # The same errors of fitted rows, each left out in turn, where others were held out.
     loo_rmse: float = math.nan
     loo_max_relative_error: float = math.nan
+    bias_p: float = 1.0  # of held-out readings so far to one side, were the bands right
+    conflicts: Sequence[str] = ()  # parameters whose posterior is at the edge of the prior
 
     @property
     def skill(self) -> float:
@@ -209,7 +213,7 @@ _RULES: tuple[tuple[str, Level, str, Callable[[Evidence], bool]], ...] = (
         "few",
         Level.CARE,
         "Too few unseen rows",
-        lambda e: binomial_p(0, e.n) > LEVEL / (len(e.checks) + 2),
+        lambda e: binomial_p(0, e.n) > LEVEL / len(_family(e)),
     ),
     ("weak", Level.CARE, "Explains little", lambda e: e.skill < WEAK_SKILL),
     ("fine", Level.FINE, "Holds on unseen rows", lambda e: True),
@@ -228,8 +232,11 @@ def _family(e: Evidence) -> tuple[Check, ...]:
     """Return the checks that have a probability, which are judged together."""
     coverage = Remark(_words("coverage", e=e), "Bands too narrow")
     pattern = Remark(_words("pattern", e=e), "Curve misses a pattern", True)
+    biased = Remark(_words("bias", e=e), "Predictions off to one side", True)
     signs_p = binomial_p(e.sign_changes, e.neighbours, 0.5)
-    return (*e.checks, Check(e.low_coverage_p, coverage), Check(signs_p, pattern))
+    # Where predictions are off, their bands are not too narrow.
+    unseen = (*([Check(e.bias_p, biased)] if e.held_out else []), Check(e.low_coverage_p, coverage))
+    return (*e.checks, *unseen, Check(signs_p, pattern))
 
 
 def checks_passed(e: Evidence) -> tuple[int, int]:
@@ -367,6 +374,7 @@ def gather(
             suspects="the units" + " and the normal load" * (role_of(model.output) == "pull"),
             notes=problem.notes,
             remarks=remarks_of(calibration),
+            conflicts=conflicts(calibration),
             checks=checks_of(calibration),
             parabolic_in=parabolic,
             fitted_at=tuple(fitted_at.tolist()),
@@ -379,7 +387,10 @@ def _unseen(problem: Problem, v: Validation | None) -> dict[str, Any]:
     """Return what was found on rows that were not fitted."""
     nothing = float("nan")
     if v is None:
-        scores = {"effective": nothing, "null_rmse": nothing, **_errors(problem, v)}
+        scores = {
+            "effective": nothing, "null_rmse": nothing, "linear_rmse": nothing,
+            **_errors(problem, v),
+        }  # fmt: skip
         return {"hits": 0, "n": 0, "low_coverage_p": 1.0, **scores}
     covered = v.scores.coverage[0.9]
     complete = bool(np.isfinite(v.draws).all(axis=1).any())
@@ -387,16 +398,43 @@ def _unseen(problem: Problem, v: Validation | None) -> dict[str, Any]:
     if complete and v.method == "held_out":
         # Held-out rows share a curve, so the binomial law would raise false alarms.
         low_coverage_p = coverage_probability(v.draws, covered.hits, 0.9)
+        bias_p = bias_probability(v.draws, v.scores.pit)
     else:
-        low_coverage_p = binomial_p(covered.hits, covered.n)
+        low_coverage_p, bias_p = binomial_p(covered.hits, covered.n), 1.0
     return {
         "hits": covered.hits,
         "n": covered.n,
         "low_coverage_p": low_coverage_p,
+        "bias_p": bias_p,
         "effective": effective_rows(v.draws) if complete else nothing,
         **_errors(problem, v),
         "null_rmse": axis_of(problem.bound.model.output).factor * null,
+        "linear_rmse": axis_of(problem.bound.model.output).factor * _linear_rmse(problem, v),
     }
+
+
+def _linear_rmse(problem: Problem, v: Validation) -> float:
+    """Return the error of a linear regression of the response on the conditions, on the same rows.
+
+    Left out in turn, or held out, as the model's are.
+    """
+    fitted = np.column_stack([np.ones(len(problem.table)), *problem.conditions.values()])
+    scale = np.abs(fitted).max(axis=0)
+    scale[scale == 0.0] = 1.0
+    coefficients, _, rank, _ = np.linalg.lstsq(fitted / scale, problem.response)
+    if v.method == "held_out":
+        at = problem.bound.model.select(v.table.columns)
+        new = np.column_stack([np.ones(len(v.table)), *at.values()])
+        predicted = new / scale @ coefficients
+    else:
+        q, _ = np.linalg.qr(fitted / scale)
+        leverage = np.square(q).sum(axis=1)
+        residual = problem.response - fitted / scale @ coefficients
+        if rank < fitted.shape[1] or leverage.max() > 1.0 - 1e-9:
+            return math.nan
+        predicted = problem.response - residual / (1.0 - leverage)
+    error = problem.bound.from_response(predicted) - v.observed
+    return float(np.sqrt(np.mean(np.square(error))))
 
 
 def _errors(problem: Problem, v: Validation | None) -> dict[str, float]:

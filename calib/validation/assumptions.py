@@ -60,16 +60,25 @@ def remarks_of(calibration: Calibration) -> tuple[Remark, ...]:
     )
 
 
+def conflicts(calibration: Calibration) -> tuple[str, ...]:
+    """Name the parameters that the data put where their priors have less than 2.5 % of the mass."""
+    priors, summary = calibration.problem.priors.central(0.95), calibration.summary
+    return tuple(
+        name
+        for name, (low, high) in priors.items()
+        if summary[name].sd_ratio <= PRIOR_SET and not low <= summary[name].median <= high
+    )
+
+
 def _surprising(calibration: Calibration) -> Iterator[Remark]:
-    """Parameters that the data put where their priors have less than 2.5 % of their mass."""
-    for name, (low, high) in calibration.problem.priors.central(0.95).items():
+    priors = calibration.problem.priors.central(0.95)
+    for name in conflicts(calibration):
         s = calibration.summary[name]
-        if s.sd_ratio <= PRIOR_SET and not low <= s.median <= high:
-            found, expected = (
-                f"{plain_number(a, 2)} to {plain_number(b, 2)}"
-                for a, b in ((s.hdi_lower, s.hdi_upper), (low, high))
-            )
-            yield remark("surprising", name=name, found=found, expected=expected)
+        found, expected = (
+            f"{plain_number(a, 2)} to {plain_number(b, 2)}"
+            for a, b in ((s.hdi_lower, s.hdi_upper), priors[name])
+        )
+        yield remark("surprising", name=name, found=found, expected=expected)
 
 
 def cut_off(problem: Problem, draws: Array) -> Iterator[Remark]:
@@ -165,8 +174,17 @@ def _estimated(calibration: Calibration, estimate: PointEstimate) -> dict[str, f
 
 
 def _least_squares(calibration: Calibration) -> PointEstimate | None:
-    """The estimate that seeded the sampler, unless it is on a bound, where others mean nothing."""
-    finite = [e for e in calibration.estimates if np.isfinite(e.rmse)]
+    """The best estimate, unless it is on a bound, where others mean nothing.
+
+    Of those that seeded the sampler; without any, by least squares unless the model is slow.
+    """
+    problem, estimates = calibration.problem, list(calibration.estimates)
+    if not estimates and not problem.bound.model.slow and problem.bound.model.uncertain is None:
+        with suppress(CalibError):
+            name = problem.bound.model.name
+            rng = generator(calibration.seed, name, "least_squares")
+            estimates = [estimate_least_squares(problem, rng)]
+    finite = [e for e in estimates if np.isfinite(e.rmse)]
     best = min(finite, key=lambda e: e.rmse, default=None)
     if best is None:
         return None

@@ -205,6 +205,13 @@ def compare(
     """
     check_comparable([models] if isinstance(models, str) else models)
     given, table = priors or {}, as_table(table)
+    if strange := [name for name in given if name not in models]:
+        raise CalibError(
+            f"priors are given for {', '.join(strange)}, which is not compared",
+            where="calib.compare, priors",
+            expected=", ".join(models),
+            hint="name the models that are compared",
+        )
     return compare_problems(
         [build_problem(name, table, given.get(name)) for name in models], seed,
         held_out=None if held_out is None else as_table(held_out), settings=settings,

@@ -309,6 +309,16 @@ def coverage_probability(draws: Array, hits: int, level: float) -> float:
     return float((1 + (covered <= hits).sum()) / (1 + covered.size))
 
 
+def bias_probability(draws: Array, pit: Array) -> float:
+    """Probability of readings that lie so far to one side, were the predictions right.
+
+    By the mean PIT of the rows (n,), beside that of draws (size, n): what rows share counts once.
+    """
+    found = abs(float(pit.mean()) - 0.5)
+    possible = np.abs(_pit_of_draws(draws).mean(axis=1) - 0.5)
+    return float((1 + (possible >= found).sum()) / (1 + possible.size))
+
+
 def binomial_p(hits: int, n: int, level: float = 0.9) -> float:
     """Probability of so few hits or fewer among n independent rows; NaN of none."""
     return float(bdtr(hits, n, level)) if n else float("nan")

@@ -93,8 +93,8 @@ def validate_held_out(calibration: Calibration, held_out: Tabular) -> Validation
     Raises
     ------
     CalibError
-        If the calibrated model has no value there, however uncertain its parameters, or a column
-        looks, as a whole, as if it were in another unit.
+        If the calibrated model has no value there, however uncertain its parameters, a column
+        looks, as a whole, as if it were in another unit, or all rows are among those calibrated on.
 
     Notes
     -----
@@ -116,6 +116,7 @@ def validate_held_out(calibration: Calibration, held_out: Tabular) -> Validation
     fitted = calibration.problem
     known = {**fitted.conditions, model.output: fitted.table[model.output]}
     check_conditions(held_out, {n: v for n, v in known.items() if n in held_out})
+    check_unseen(fitted.table, held_out, (*fitted.conditions, model.output))
     rng = generator(calibration.seed, calibration.label, "validate")
     _, draws = predictive_draws(calibration, model.select(held_out.columns), rng)
     draws = draws[np.isfinite(draws).all(axis=1)]
@@ -129,6 +130,21 @@ def validate_held_out(calibration: Calibration, held_out: Tabular) -> Validation
     observed = held_out[model.output]
     scores = score(draws, observed, heavy=calibration.problem.heavy)
     return Validation("held_out", held_out, observed, draws, scores, index=index)
+
+
+def check_unseen(fitted: Table, held_out: Table, columns: Sequence[str]) -> None:
+    """Raise a CalibError if all rows to validate on are among those that are fitted."""
+    if not all(name in t for t in (fitted, held_out) for name in columns):
+        return
+    seen, rows = ({*zip(*(t[name] for name in columns), strict=True)} for t in (fitted, held_out))
+    if rows <= seen:
+        raise CalibError(
+            f"all {len(held_out)} rows to validate on are rows that are fitted",
+            where=held_out.source,
+            expected="rows that the fit has not seen",
+            hint="hold rows out before the fit (calib.hold_out), or leave each out in turn "
+            "(calib.leave_one_out)",
+        )
 
 
 @takes(calibration=Calibration, settings=SamplerSettings)

@@ -164,7 +164,7 @@ def test_fewer_settings_than_parameters_are_told() -> None:
     columns = {"Slip (%)": 100.0 * slip, "drawbar_pull_kn": pull}
     problem = build_problem("magic_formula", table_from_arrays(columns, source="few.csv"))
     said = " | ".join(remark.text for remark in file_remarks(problem, 0.03))
-    assert "few.csv: the rows are at 3 different settings of the conditions" in said
+    assert "the rows are at 3 different settings of the conditions" in said
     assert "about 6 parameters" in said
 
 

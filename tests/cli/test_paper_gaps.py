@@ -149,7 +149,9 @@ def test_effects_are_of_a_diagnosis_alone(calib: Calib, run: Path) -> None:
 
 
 def test_what_comes_of_reconstructed_data_says_so(calib: Calib) -> None:
-    said = "They are not measurements: that the models fit follows from how they were made."
+    said = (
+        "They are not measurements: that models fit them follows in part from how they were made."
+    )
     assert calib("data", "he2019-gaps", "--out", "gaps").code == 0
     # A copy under another name is what it is.
     Path("gaps/nominal_slip").rename("mine")

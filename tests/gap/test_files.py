@@ -199,7 +199,8 @@ def test_conditions_are_told_by_ends_or_by_the_name_of_a_category():
         found, data=replace(found.data, case=case), regions=regions,
         inclusion=replace(found.inclusion, where=regions[::-1]),
         next_measurements=(NextMeasurement(
-            ("none", "unknown"), {"operator": 0.0, "warmth": 0.0, "slip_ratio": 0.3}, 1.25
+            ("none", "unknown"), {"operator": 0.0, "warmth": 0.0, "slip_ratio": 0.3}, 1.25,
+            "rut_depth", ((20.0, 1.0), (22.0, 1.0)),
         ),),
     ))  # fmt: skip
     conditions = [{"operator": ["Lind"]}, {"warmth": [0.0, 8.0]}, {"slip_ratio": [0.2, 0.4]}]

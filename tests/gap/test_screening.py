@@ -17,7 +17,7 @@ from calib.gap.constants import FIELD_OUTLIER, LAB_OUTLIER
 from calib.gap.diagnose import diagnose, screened_ranking
 from calib.gap.effects import EFFECTS
 from calib.gap.files import document
-from calib.gap.plausibility import oddities
+from calib.gap.plausibility import oddities, units_in_doubt
 from calib.gap.screening import _possible, check_units, without_far_conditions
 from calib.report.gap_words import Tone, gap_verdict
 from tests.gap.cases import PULL_ONLY, make_case, table_without, write_case
@@ -138,7 +138,8 @@ def changed(case: Case, campaign: str, column: str, rows, factor: float) -> Case
 
 
 def oddities_of(case):
-    return oddities(case.lab, case.field, case.models)
+    units = units_in_doubt(case.lab, case.field, case.models)
+    return [*(remark.text for remark in units), *oddities(case.lab, case.field, case.models)]
 
 
 @pytest.mark.parametrize("campaign", ["lab", "field"])
@@ -310,7 +311,9 @@ def altered(case, **columns):
 
 
 def said(case) -> str:
-    return "\n".join(oddities(case.lab, case.field, case.models))
+    units = units_in_doubt(case.lab, case.field, case.models)
+    texts = (*(r.text for r in units), *oddities(case.lab, case.field, case.models))
+    return "\n".join(texts)
 
 
 def test_a_fair_pair_has_nothing_odd():

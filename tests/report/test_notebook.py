@@ -132,19 +132,69 @@ def test_a_table_may_be_a_dictionary_or_a_data_frame():
 def test_tables_problems_and_validations_are_short_too(tmp_path):
     table = calib.load_he2019("drawbar_pull")
     _, held = calib.hold_out(table, "inflation_pressure_psi", 30)
-    validation = calib.validate_held_out(calibrated(), held)
+    with pytest.raises(calib.CalibError, match="all 14 rows to validate on are"):
+        calib.validate_held_out(calibrated(), held)
+    validation = calib.leave_one_out(calibrated())
     judged = calib.verdict(calibrated(), validation)
     for found in (table, calibrated().problem, validation, judged):
         assert len(repr(found)) < 300
     assert len(table.to_dataframe()) == len(table)
     frame = validation.to_dataframe()
-    np.testing.assert_array_equal(frame["observed"], held["drawbar_pull_kn"])
+    np.testing.assert_array_equal(frame["observed"], table["drawbar_pull_kn"])
     assert "<table" in validation._repr_html_()
     calib.save_calibration(calibrated(), str(tmp_path / "new" / "run"))
     again = calib.build_problem(
         "magic_formula_pressure", str(tmp_path / "new" / "run" / "data.csv")
     )
     assert len(again.table) == len(calibrated().problem.table)
+
+
+def test_rows_that_were_held_out_keep_their_labels():
+    data = pd.DataFrame(
+        {"average_ground_pressure_kpa": [60, 80, 100, 120, 140, 160.0],
+         "rut_depth_mm": [11.0, 15.2, 18.1, 22.3, 25.0, 29.4]}, index=list("uvwxyz"),
+    )  # fmt: skip
+    fitted, held = calib.hold_out(data, "average_ground_pressure_kpa", [80, 140])
+    assert list(fitted.to_dataframe().index) == list("uwxz")
+    calibration = calib.calibrate(calib.build_problem("bekker", fitted), seed=1)
+    assert list(calib.predict(calibration, held).to_dataframe().index) == ["v", "y"]
+    assert list(calib.validate_held_out(calibration, held).to_dataframe().index) == ["v", "y"]
+
+
+def test_readings_to_one_side_are_no_good_validation():
+    rng = np.random.default_rng(2)
+    p = np.tile(np.linspace(60.0, 200.0, 10), 3)
+    ruts = 24.0 * p / 130.0 * np.exp(0.05 * rng.standard_normal(30))
+    data = pd.DataFrame({"average_ground_pressure_kpa": p, "rut_depth_mm": ruts})
+    calibration = calib.calibrate(calib.build_problem("bekker", data[:15]), seed=1)
+    for bias, headline in ((0.0, "Holds on unseen rows"), (3.0, "Predictions off to one side")):
+        new = data[15:].assign(rut_depth_mm=data["rut_depth_mm"][15:] + bias)
+        judged = calib.verdict(calibration, calib.validate_held_out(calibration, new))
+        assert judged.headline == headline
+
+
+def test_a_prior_that_the_data_contradict_is_said_without_an_estimate_too(tmp_path):
+    (tmp_path / "mine.toml").write_text(
+        'model = "modified_bekker"\n[parameters.n1]\ndist = "normal"\nmean = 0.0\nsd = 0.01\n'
+        'unit = "1"\nreason = "wrong"\nsource = "this test"\n'
+    )
+    ruts = calib.load_he2019("rut_depth")
+    problem = calib.build_problem("modified_bekker", ruts, tmp_path / "mine.toml")
+    calibration = calib.calibrate(problem, seed=1)
+    assert calib.verdict(calibration).headline == "Prior contradicted"
+    calib.save_calibration(calibration, tmp_path / "run")
+    assert calib.verdict(calib.load_calibration(tmp_path / "run")).headline == "Prior contradicted"
+
+
+def test_priors_of_a_model_that_is_not_compared_are_refused():
+    ruts = calib.load_he2019("rut_depth")
+    with pytest.raises(calib.CalibError, match="priors are given for bekkr, which is not compared"):
+        calib.compare(["bekker", "lyasko"], ruts, priors={"bekkr": "nothing.toml"})
+
+
+def test_truth_values_are_no_readings():
+    with pytest.raises(calib.CalibError, match="of type bool, not numbers"):
+        calib.build_problem("bekker", {"average_ground_pressure_kpa": [True], "rut_depth_mm": [1]})
 
 
 def test_what_is_no_table_is_refused_with_what_would_be_one():

@@ -39,6 +39,7 @@ FINE = Evidence(
     prior_set=(),
     two_pressures=False,
     null_rmse=0.13,
+    linear_rmse=0.09,
     sign_changes=12,
     neighbours=26,
     along="slip",
@@ -69,6 +70,7 @@ CASES = {
     "between": RULES["extrapolated"] | {"unseen_at": Where.BETWEEN, "effective": 1.8},
     "nothing unseen": {"n": 0, "rmse": float("nan")},
     "set by the prior": {"prior_set": ("C2",)},
+    "in conflict": {"conflicts": ("n0",)},
     "lucky": {"loo_rmse": 0.52, "loo_max_relative_error": 0.9},
     "lucky and wrong": RULES["misfit"] | {"loo_rmse": 0.52},
     "unlucky": {"loo_rmse": 0.03, "loo_max_relative_error": 0.05},
@@ -85,7 +87,9 @@ def test_what_is_said(case, snapshot):
                        fitted_at=(18.0, 42.0))  # fmt: skip
     found = judge_evidence(evidence)
     assert found.rule == case or case not in RULES
-    assert (found.level is Level.FINE) == (case in ("fine", "set by the prior", "lucky", "unlucky"))
+    assert (found.level is Level.FINE) == (
+        case in ("fine", "set by the prior", "in conflict", "lucky", "unlucky")
+    )
     document = json.loads(json.dumps(found.document(), allow_nan=False))
     assert Verdict.of(document) == found
     assert document == snapshot
@@ -181,16 +185,23 @@ def test_where_the_held_out_rows_lie(drawbar, psi, where):
     columns = dict(table.columns) | {"inflation_pressure_psi": np.full(len(table), psi)}
     held = replace(drawbar.validation, table=replace(table, columns=columns))
     assert of(replace(drawbar, validation=held)).unseen_at is where
-    left_out = replace(held, method="leave_one_out")
-    assert of(replace(drawbar, validation=left_out)).unseen_at is Where.AT
 
 
 def test_evidence_of_other_validations(density, rut, unconverged):
     evidence, scores = of(density), density.validation.scores
     assert not evidence.held_out
+    assert evidence.unseen_at is Where.AT
     assert evidence.low_coverage_p == pytest.approx(binomial_p(scores.coverage[0.9].hits, 36))
     expected = 1 - scores.rmse**2 / np.var(density.validation.observed)
     assert evidence.skill == pytest.approx(expected)
+    # Linear regressions, each without a row.
+    problem = density.calibration.problem
+    x = np.column_stack([np.ones(36), *problem.conditions.values()])
+    y = problem.observed
+    left_out = [
+        x[i] @ np.linalg.lstsq(np.delete(x, i, 0), np.delete(y, i))[0] - y[i] for i in range(36)
+    ]
+    assert evidence.linear_rmse == pytest.approx(np.sqrt(np.mean(np.square(left_out))))
     scores = replace(rut.validation.scores, rmse=float("nan"))
     draws = np.full_like(rut.validation.draws, np.nan)
     broken = replace(rut, validation=replace(rut.validation, scores=scores, draws=draws))

@@ -203,7 +203,7 @@ def test_a_posterior_at_the_edge_of_its_prior_is_told(mean: float, told: bool) -
     found = calibrated(normal("b", mean, 0.3 / stats.norm.ppf(0.975)), SLIP, LINE)
     said = " ".join(remark.text for remark in remarks_of(found))
     expected = f"prior {mean - 0.3:.2g} to {mean + 0.3:.2g} (95 % each)"
-    assert ("move b to the edge of its prior" in said and expected in said) is told
+    assert ("conflict with the prior of b: " in said and expected in said) is told
 
 
 def test_copies_are_named_by_line() -> None:

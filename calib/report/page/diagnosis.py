@@ -93,6 +93,7 @@ def render_page(
             groups=hypothesis_groups(d),
             name=short_name,
             relevance=(LEFT, MOST_LEFT, MIN_EFFECT_SIZE, MIN_EFFECT_SIZE_IN_PAIR),
+            equations={name: equation(latex, "") for name, latex in d.equations.items()},
             simulators=[
                 {
                     "title": o.title,

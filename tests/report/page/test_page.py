@@ -148,7 +148,7 @@ def test_validation_facts_have_the_numbers_in_the_unit_of_the_file(rut):
     s = rut.validation.scores
     text = page({"rut_depth": rut})[1].text
     assert f"Covered by the 90 % band{s.coverage[0.9].hits} of 9" in text
-    assert f"Root mean square error of the median{s.rmse:.2f} mm" in text
+    assert f"Rms error of the predicted median{s.rmse:.2f} mm" in text
     assert f"Largest relative error{100 * s.max_relative_error:.1f} %" in text
     header = ("Rut depth [m]",)
     in_metres = replace(rut, task=replace(rut.task, table=replace(rut.task.table, header=header)))
