@@ -59,11 +59,12 @@ def export(
     if not calibration.converged:
         announce("this calibration did not converge; it is not to be used")
     wanted = Wanted(out, conditions, draws, each)
-    files = FORMATS[form](calibration, wanted)
+    files, said = FORMATS[form](calibration, wanted)
     if there := [path for path in files if path.exists()]:
         raise CalibError(
             "the file exists already", where=str(there[0]), hint="choose another --out"
         )
+    print(said)
     with writing(out):
         for path, text in files.items():
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -85,23 +86,24 @@ def _condition(text: str) -> tuple[str, float]:
         ) from None
 
 
-def _tir(calibration: Calibration, wanted: Wanted) -> dict[Path, str]:
+def _tir(calibration: Calibration, wanted: Wanted) -> tuple[dict[Path, str], str]:
+    """Return the files with their texts, and what to say of them."""
     from calib.data.files import table_csv
     from calib.inference.tyre import tir_draws, to_tir
     from calib.models.tir import FORCE
 
-    out = wanted.out
-    files = {out: to_tir(calibration, at=wanted.at).text}
+    out, tyre = wanted.out, to_tir(calibration, at=wanted.at)
+    files, said = {out: tyre.text}, "\n".join(tyre.comments)
     if not wanted.draws:
-        return files
+        return files, said
     drawn = tir_draws(calibration, wanted.draws, at=wanted.at)
-    rows = [{**tyre.sections["VERTICAL"], **tyre.sections[FORCE]} for tyre in drawn]
+    rows = [{**one.sections["VERTICAL"], **one.sections[FORCE]} for one in drawn]
     columns = {"draw": range(1, len(rows) + 1)} | {k: [row[k] for row in rows] for k in rows[0]}
     beside = out.with_name(f"{out.stem}_draws")
     files[beside.with_suffix(".csv")] = table_csv(columns)
     if wanted.each:
-        files |= {beside / f"{i:04}.tir": tyre.text for i, tyre in enumerate(drawn, start=1)}
-    return files
+        files |= {beside / f"{i:04}.tir": one.text for i, one in enumerate(drawn, start=1)}
+    return files, said
 
 
-FORMATS: Mapping[str, Callable[[Calibration, Wanted], dict[Path, str]]] = {"tir": _tir}
+FORMATS: Mapping[str, Callable[[Calibration, Wanted], tuple[dict[Path, str], str]]] = {"tir": _tir}

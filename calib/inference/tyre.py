@@ -55,8 +55,6 @@ def _fitted(x: Array, pull: Array, start: Array) -> _Fitted:
     low, high = _ONE_PRESSURE.searched["C"]
     # G = 1 - E may be zero; its logarithm must begin somewhere.
     G = [np.log(max(1.0 - E, 1e-3))] * (1 + both)
-    lower, upper = np.full(4 + both, -np.inf), np.full(4 + both, np.inf)
-    lower[1], upper[1] = low, high
 
     def formula(z: Array) -> tuple[float, ...]:
         K, D, driving, braking = np.exp(z[[0, 2, 3, 3 + both]])
@@ -69,6 +67,9 @@ def _fitted(x: Array, pull: Array, start: Array) -> _Fitted:
         return np.asarray(off / np.abs(pull).max())
 
     begin = np.array([np.log(K), np.clip(C, low, high), np.log(D), *G])
+    # A curve that does not reach its peak leaves D and E open: no factor beyond a thousand.
+    lower, upper = begin - np.log(1e3), begin + np.log(1e3)
+    lower[1], upper[1] = low, high
     found = least_squares(residuals, begin, bounds=(lower, upper), x_scale="jac")
     off = np.abs(found.fun).max() * np.abs(pull).max()
     return _Fitted(*map(float, (*formula(found.x), off)))

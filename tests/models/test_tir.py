@@ -142,6 +142,14 @@ def test_units_are_those_of_the_file(read: Callable[[str], TyreFile]) -> None:
     assert read(other).longitudinal_force(0.1, 4000.0, 2.4e5) == pytest.approx(wanted, rel=1e-12)
 
 
+def test_pac2002_names_pressures_and_scales_of_its_own(read: Callable[[str], TyreFile]) -> None:
+    own = TYRE.replace("[OPERATING_CONDITIONS]\nINFLPRES =\nNOMPRES = 2.0D5", "[TIRE_CONDITIONS]\n"
+                       "IP = 2.4e5\nIP_NOM = 4e5")  # fmt: skip
+    own = own.replace("LKX = 0.95", "LKX = 0.95\nLIP = 0.5\nLGAX = 2")
+    wanted = read(TYRE).longitudinal_force(0.1, 4000.0, 2.4e5, 0.2)
+    assert read(own).longitudinal_force(0.1, 4000.0, camber_rad=0.1) == pytest.approx(wanted)
+
+
 def test_arguments_broadcast_and_a_wheel_in_the_air_gives_nothing(
     read: Callable[[str], TyreFile],
 ) -> None:
