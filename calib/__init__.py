@@ -30,9 +30,11 @@ if TYPE_CHECKING:
     from calib.inference.io import load_calibration, save_calibration, to_datatree
     from calib.inference.problem import Problem, build_problem
     from calib.inference.sampler import SamplerSettings
+    from calib.inference.tyre import to_tir
     from calib.models import MODELS, Model
     from calib.models.simulators.declaration import from_callable
     from calib.models.simulators.files import read_simulator
+    from calib.models.tir import TyreFile, read_tir
     from calib.report.gap_words import gap_verdict
     from calib.report.verdict import Verdict, verdict
     from calib.validation.prediction import Prediction
@@ -59,9 +61,11 @@ _HOME = {
     "calib.inference.io": "load_calibration save_calibration to_datatree",
     "calib.inference.problem": "Problem build_problem",
     "calib.inference.sampler": "SamplerSettings",
+    "calib.inference.tyre": "to_tir",
     "calib.models": "MODELS Model",
     "calib.models.simulators.declaration": "from_callable",
     "calib.models.simulators.files": "read_simulator",
+    "calib.models.tir": "TyreFile read_tir",
     "calib.report.gap_words": "gap_verdict",
     "calib.report.verdict": "Verdict verdict",
     "calib.validation.comparison": "Comparison compare",
@@ -88,6 +92,7 @@ __all__ = [
     "Range",
     "SamplerSettings",
     "Table",
+    "TyreFile",
     "Validation",
     "Verdict",
     "build_problem",
@@ -109,6 +114,7 @@ __all__ = [
     "read_plan",
     "read_simulator",
     "read_table",
+    "read_tir",
     "register",
     "run_audit",
     "run_campaign",
@@ -116,6 +122,7 @@ __all__ = [
     "suggest_mapping",
     "table_from_arrays",
     "to_datatree",
+    "to_tir",
     "validate_held_out",
     "verdict",
 ]
@@ -143,14 +150,17 @@ _UNLISTED = [
     "Prediction",
     "Problem",
     "Table",
+    "TyreFile",
     "Validation",
     "Verdict",
     "estimate",
     "read_plan",
+    "read_tir",
     "run_audit",
     "run_campaign",
     "suggest_mapping",
     "table_from_arrays",
+    "to_tir",
 ]
 
 

@@ -17,6 +17,7 @@ from calib.cli import (
     campaign,
     check,
     declared,
+    export,
     imports,
     interrupted,
     options,
@@ -84,6 +85,7 @@ _COMMANDS: Mapping[str, Mapping[Callable[..., None], str]] = {
         imports.import_: "import run7.xlsx --out my.csv",
         calibration.fit: "fit my.csv --model magic_formula_pressure --out run",
         prediction.predict: "predict run --at conditions.csv --out predicted.csv",
+        export.export: "export run --at inflation_pressure_psi=30 --out tyre.tir",
         calibration.report: "report my.csv --hold-out inflation_pressure_psi=30 --out report",
         calibration.compare: "compare bekker reece plates.csv --hold-out plate_width_mm=80 "
         "--out compared",

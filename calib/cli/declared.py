@@ -75,6 +75,10 @@ def priors(
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="TOML to write; by default printed.")
     ] = None,
+    from_tir: Annotated[
+        Path | None,
+        typer.Option(help="Tyre property file to put the priors of magic_formula about."),
+    ] = None,
     plugins: opt.Models = None,
     simulator: opt.Simulators = None,
 ) -> None:
@@ -82,7 +86,19 @@ def priors(
     from calib.inference.prior_files import default_priors
     from calib.models import get_model
 
-    _emit(default_priors(get_model(model).name).read_text(encoding="utf-8"), out)
+    name = get_model(model).name
+    if from_tir is None:
+        _emit(default_priors(name).read_text(encoding="utf-8"), out)
+        return
+    from calib import read_tir
+    from calib.inference.tyre import priors_from_tir
+
+    if name != "magic_formula":
+        raise CalibError(
+            f"a tyre property file gives no priors of {name}", where="--from-tir",
+            expected="the model magic_formula", hint="name that, or leave --from-tir out",
+        )  # fmt: skip
+    _emit(priors_from_tir(read_tir(from_tir)), out)
 
 
 def _emit(text: str, out: Path | None) -> None:

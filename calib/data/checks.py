@@ -446,7 +446,7 @@ def hold_out(
             expected="values that only some of the rows have",
             hint="hold out something else",
         )
-    levels = np.unique(values[~np.isnan(values)]) / column.to_canonical(1.0)
+    levels = column.written(np.unique(values[~np.isnan(values)]))
     present = list(dict.fromkeys(f"{v:.6g}" for v in levels))
     present[12:] = [f"and {len(present) - 12} more"] * (len(present) > 12)
     raise CalibError(

@@ -220,7 +220,7 @@ def _impossible(of: _Values) -> Iterator[Fault]:
             )
         elif _is_code(np.array(value)):
             hint = "if it stands for a missing value, delete the row or leave the cell empty"
-        elif not small[i]:
+        elif not small[i] and not of.column.kappa:
             found, hint = f"{cell!r} is too large for a reading", quantity.hint
         else:
             hint = _range_hint(of, value)
@@ -230,11 +230,13 @@ def _impossible(of: _Values) -> Iterator[Fault]:
 def _range_hint(of: _Values, value: float) -> str:
     """Say what may be the matter with a value outside the range."""
     quantity, hint = of.column.quantity, of.column.quantity.hint
+    if of.column.kappa:
+        return "slip goes down to s = 1 - v/(ωr) = -1, which is κ = -0.5: leave the row out"
     if quantity.kind == "slip" and value > 0.0:
         # The driven wheel's slip of SAE J670 has no upper bound.
         hint = (
-            "slip is s = 1 - v/(ωr) here, at most 1: if it was recorded as κ = ωr/v - 1, convert "
-            "every row, s = κ/(1 + κ)"
+            "slip is s = 1 - v/(ωr) here, at most 1: if it was recorded as κ = ωr/v - 1, rename "
+            f"the column {quantity.stem}_kappa_ratio or {quantity.stem}_kappa_percent"
         )
     if "percent" in quantity.units and of.column.unit == "dimensionless" and abs(value) <= 100.0:
         # Renamed for the sake of a few, the others would be a hundredth of what they are.

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib.data.files import plain_number
-from calib.data.quantities import QUANTITIES, UNITS, Quantity, convert
+from calib.data.quantities import QUANTITIES, UNITS, Quantity, Range, convert
 from calib.errors import CalibError, meant
 from calib.shown import Shown
 
@@ -33,6 +33,8 @@ _QUALIFIERS = frozenset({
 
 # What a user puts behind a header whose values are to be believed as they are.
 CHECKED = "(checked)"
+# In the header of a slip κ = ωr/v - 1, between its name and its unit.
+KAPPA = "kappa"
 
 
 @dataclass(frozen=True)
@@ -49,12 +51,24 @@ class Column:
         """Whether the user says that its values are right, however unusual."""
         return self.header.rstrip().lower().endswith(CHECKED)
 
+    @property
+    def kappa(self) -> bool:
+        """Whether its values are slips κ = ωr/v - 1 and not s = 1 - v/(ωr)."""
+        return self.quantity.kind == "slip" and KAPPA in normal(self.header).split("_")
+
     def to_canonical(self, values: ArrayLike) -> NDArray[np.float64]:
         """Convert values in this column's unit to the canonical unit, any shape."""
-        return convert(values, self.unit, self.quantity.unit)
+        found = convert(values, self.unit, self.quantity.unit)
+        if not self.kappa:
+            return found
+        with np.errstate(divide="ignore", invalid="ignore"):  # a locked wheel has no s
+            return np.asarray(found / (1.0 + found))
 
     def written(self, values: ArrayLike) -> NDArray[np.float64]:
         """Convert canonical values to this column's unit, any shape."""
+        if self.kappa:
+            with np.errstate(divide="ignore", invalid="ignore"):  # a wheel on the spot has no κ
+                values = np.asarray(values, dtype=np.float64) / (1.0 - np.asarray(values))
         return convert(values, self.quantity.unit, self.unit)
 
     @property
@@ -70,7 +84,11 @@ class Column:
     @property
     def expected(self) -> str:
         """The allowed values, in this column's unit."""
-        return self.quantity.range.describe(self.quantity.unit, self.unit)
+        allowed = self.quantity.range
+        if self.kappa:
+            low, high = self.written([allowed.low, allowed.high]).tolist()
+            return Range(low, high).describe(self.unit, self.unit)
+        return allowed.describe(self.quantity.unit, self.unit)
 
 
 def accepted_headers(quantity: Quantity) -> tuple[str, ...]:
@@ -78,13 +96,15 @@ def accepted_headers(quantity: Quantity) -> tuple[str, ...]:
     names = [quantity.canonical]
     names += [quantity.stem] if quantity.bare_unit else []
     names += [f"{quantity.stem}_{suffix}" for suffix in quantity.units]
+    if quantity.kind == "slip":
+        names += [f"{quantity.stem}_{KAPPA}_{suffix}" for suffix in ("ratio", "percent")]
     return tuple(dict.fromkeys(names))
 
 
 def normal(header: str) -> str:
     """Bring a header to lower case words joined by underscores, without `CHECKED`."""
     text = header.lower().rstrip().removesuffix(CHECKED)
-    text = text.replace("%", " percent ").replace("³", "3").replace("²", "2")
+    text = text.replace("%", " percent ").replace("³", "3").replace("²", "2").replace("κ", KAPPA)
     return re.sub(r"[\s_\-/()\[\]{},.:·]+", "_", re.sub(r"\^|\*\*", "", text)).strip("_")
 
 
@@ -115,6 +135,8 @@ def parse_header(header: str, *, where: str = "", position: int = 0) -> Column |
     if named is None:
         return None
     quantity, suffix = named
+    if quantity.kind == "slip":
+        suffix = suffix.removeprefix(KAPPA).removeprefix("_")
     unit = quantity.units.get(suffix) if suffix else quantity.bare_unit
     if unit is not None:
         return Column(header, quantity, unit, position)
@@ -167,14 +189,17 @@ def _unit_error(header: str, quantity: Quantity, suffix: str, where: str) -> Cal
         found = f"{suffix!r} is a unit of {kinds[0]}, but {quantity.stem} is a {quantity.kind}"
     else:
         found = f"{suffix!r} is not a known unit of {quantity.stem}"
+    stem, example = quantity.stem, quantity.canonical
+    if Column(header, quantity, "").kappa:
+        stem, example = f"{stem}_{KAPPA}", f"{stem}_{KAPPA}_ratio"
     near = difflib.get_close_matches(suffix, quantity.units, n=1, cutoff=0.5)
     factor = _foreign_unit(header, suffix, quantity) if suffix else 0.0
     if factor:
         hint = f"multiply the readings by {factor:g}, and name the column {quantity.canonical}"
     elif near:
-        hint = f"did you mean {quantity.stem}_{near[0]}?"
+        hint = f"did you mean {stem}_{near[0]}?"
     else:
-        hint = f"rename the column, for example {quantity.canonical}, with the unit of its readings"
+        hint = f"rename the column, for example {example}, with the unit of its readings"
     if suffix and not factor:
         hint += "; what is in no such unit must be converted first"
     return CalibError(
@@ -487,7 +512,7 @@ class Table(Shown):
             column = self._headers.get(name)
             if column is None:
                 found[name] = values
-            elif column.unit == column.quantity.unit:
+            elif column.unit == column.quantity.unit and not column.kappa:
                 found[column.header] = values
             else:
                 found[column.header] = _written_exactly(column, np.asarray(values))

@@ -225,7 +225,8 @@ WORDS = (
     "compare bekker reece none.csv --out out",
     "campaign none.toml --out out --workers 2",
     "template none --out t.csv", "models bekker", "effects slip_zero_shift --json",
-    "quantities slip", "priors none",
+    "quantities slip", "priors none --from-tir t.tir",
+    "export none --at inflation_pressure_psi=30 --out t.tir --draws 3 --each",
 )  # fmt: skip
 
 

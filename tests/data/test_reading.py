@@ -8,9 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from syrupy.assertion import SnapshotAssertion
 
-from calib.data import read_table, table_from_arrays, write_table
+from calib.data import hold_out, read_table, table_from_arrays, write_table
+from calib.data.table import parse_header
 from calib.errors import CalibError
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
@@ -59,6 +62,52 @@ def test_a_file_becomes_columns_in_canonical_units(my_csv: Write) -> None:
     assert (table.ignored, table.extra) == (("operator",), {"operator": ("A", "B")})
     assert (table.source, table.label) == (str(path), "made up")
     assert table.sha256 == hashlib.sha256(GOOD.encode()).hexdigest()
+
+
+@pytest.mark.parametrize("header", ["slip_kappa_percent", "Slip κ [%]", "slip_kappa_ratio"])
+def test_a_slip_may_be_kappa(my_csv: Write, header: str) -> None:
+    unit = 1.0 if header.endswith("ratio") else 100.0
+    kappa = np.array([-0.5, -0.2, 0.0, 0.25, 9.0])
+    rows = "".join(f"{unit * k!r},{i}\n" for i, k in enumerate(kappa.tolist()))
+    table = read_table(my_csv(f"{header},drawbar_pull_kn\n{rows}"))
+    np.testing.assert_allclose(table["slip_ratio"], [-1.0, -0.25, 0.0, 0.2, 0.9], atol=1e-15)
+    np.testing.assert_allclose(
+        table.column("slip_ratio").written(table["slip_ratio"]), unit * kappa
+    )
+    written = table.as_in_file({"slip_ratio": table["slip_ratio"]})
+    assert written[header] == pytest.approx(unit * kappa)
+    kept, held = hold_out(table, header, unit * 0.25)
+    assert (len(kept), held["slip_ratio"].tolist()) == (4, [0.2])
+    with pytest.raises(CalibError, match=f"the values present: {-0.5 * unit:g}"):
+        hold_out(table, header, unit * 0.3)
+
+
+@given(st.floats(-0.5, 1e6))
+def test_kappa_comes_back(kappa: float) -> None:
+    column = parse_header("slip_kappa_ratio")
+    assert column is not None
+    slip = float(column.to_canonical(kappa))
+    assert -1.0 <= slip < 1.0
+    # 1 + kappa is 1/(1 - s): of a spinning wheel s is near 1, where digits are few.
+    assert float(column.written(slip)) == pytest.approx(kappa, rel=1e-15 * (3.0 + abs(kappa)))
+
+
+@pytest.mark.parametrize(
+    ("header", "cell", "words"),
+    [
+        ("slip_kappa", "0.1", ["does not say the unit", "for example slip_kappa_ratio"]),
+        ("slip_kappa_prcent", "10", ["did you mean slip_kappa_percent?"]),
+        ("slip_kappa_percent", "-80", ["-50", "is κ = -0.5: leave the row out"]),
+        ("slip_kappa_ratio", "-1", ["of at least -0.5", "leave the row out"]),
+        ("slip_ratio", "1.7", ["κ = ωr/v - 1, rename the column slip_kappa_ratio"]),
+    ],
+)
+def test_slips_that_are_none_are_refused(
+    my_csv: Write, header: str, cell: str, words: list[str]
+) -> None:
+    message = refusal(my_csv(f"{header},drawbar_pull_kn\n{cell},1\n"))
+    for word in words:
+        assert word in message
 
 
 @pytest.mark.parametrize(

@@ -21,8 +21,8 @@ import numpy as np
 from calib.batch.folders import writing
 from calib.batch.tasks import read_seconds, run_tasks
 from calib.data.files import plain_number
-from calib.data.quantities import QUANTITIES, convert, real_array
-from calib.data.table import parse_header
+from calib.data.quantities import QUANTITIES, real_array
+from calib.data.table import Column, parse_header
 from calib.errors import CalibError
 from calib.models.base import Array
 from calib.models.constants import FIRST_RUNS, TAIL_CHARACTERS
@@ -148,7 +148,7 @@ class Simulator:
 
     def canonical(self, header: str) -> str:
         """Return the canonical column of one of its headers, which must name a known quantity."""
-        return _parsed(header, self.name)[0]
+        return _parsed(header, self.name).quantity.canonical
 
     def place(self, kind: Kind = "error") -> str:
         """Return where to look if runs fail in some way: the file and the key, for messages."""
@@ -185,19 +185,19 @@ class Simulator:
         """Return conditions by the simulator's own names and in its units."""
         found = {}
         for name, header in self.conditions.items():
-            column, unit = _parsed(header, self.name)
-            found[name] = convert(conditions[column], QUANTITIES[column].unit, unit)
+            column = _parsed(header, self.name)
+            found[name] = column.written(conditions[column.quantity.canonical])
         return found
 
     def converted(self, found: RawOutputs, output: str) -> Array:
         """Return an output, by its canonical column, in its canonical unit."""
         own = next(o for o in self.outputs if self.canonical(o.header) == output)
-        unit = _parsed(own.header, self.name)[1]
+        column = _parsed(own.header, self.name)
         try:
-            values = real_array(found[own.column], unit)
+            values = real_array(found[own.column], column.unit)
         except CalibError as error:
             raise error.within(own.column) from None
-        return convert(values, unit, QUANTITIES[output].unit)
+        return column.to_canonical(values)
 
     def _once(
         self, parameters: Mapping[str, float], conditions: Mapping[str, Array], n: int
@@ -207,15 +207,15 @@ class Simulator:
             return found
         canonical: dict[str, Array] = {}
         for output in self.outputs:
-            column, unit = _parsed(output.header, self.name)
-            values = checked(found, output.column, n, unit)
+            column = _parsed(output.header, self.name)
+            values = checked(found, output.column, n, column.unit)
             if isinstance(values, Failure):
                 return values
-            canonical[column] = convert(values, unit, QUANTITIES[column].unit)
+            canonical[column.quantity.canonical] = column.to_canonical(values)
         return canonical
 
 
-def _parsed(header: str, name: str) -> tuple[str, str]:
+def _parsed(header: str, name: str) -> Column:
     found = parse_header(header, where=f"simulator {name}")
     if found is None:
         raise CalibError(
@@ -223,7 +223,7 @@ def _parsed(header: str, name: str) -> tuple[str, str]:
             expected=", ".join(QUANTITIES) + ", or the same in another unit",
             hint="correct the name, or calib.register a Quantity of it (in a file for --models)",
         )  # fmt: skip
-    return found.quantity.canonical, found.unit
+    return found
 
 
 def not_made(why: str, hint: str = "correct that") -> CalibError:

@@ -49,6 +49,12 @@ def test_runs_are_made_once(tmp_path: Path, on_disk: bool) -> None:
     assert "negative friction" in first[2].failure.reason
 
 
+def test_a_simulator_may_take_kappa() -> None:
+    own = replace(simulator(), conditions={"k": "slip_kappa_percent"})
+    assert own.takes == ("slip_ratio",)
+    np.testing.assert_allclose(own.asked({"slip_ratio": np.array([-1.0, 0.2])})["k"], [-50.0, 25.0])
+
+
 def test_other_conditions_replicates_and_simulators_are_other_runs(tmp_path: Path) -> None:
     CALLS.clear()
     keeper = RunKeeper(simulator(), tmp_path)
