@@ -43,14 +43,20 @@ from calib.data.quantities import OUTPUTS, output_of
 from calib.data.reader import Tabular
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration, ParameterSummary, sd_ratios, summarise
-from calib.inference.constants import HALF_LN_2PI
+from calib.inference.constants import CHUNK_CELLS, HALF_LN_2PI
 from calib.inference.diagnostics import judge
 from calib.inference.mode import climb, find_modes, prior_widths
 from calib.inference.prior_files import PriorFile
-from calib.inference.priors import Prior, Priors
+from calib.inference.priors import Prior, Priors, SumAndRatio, sum_and_ratio
 from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator, stream
-from calib.inference.sampler import Draws, Progress, SamplerSettings, sample_joint
+from calib.inference.sampler import (
+    Draws,
+    Progress,
+    SamplerSettings,
+    in_coordinates,
+    sample_joint,
+)
 from calib.models import get_model
 from calib.models.base import Array, BoundModel, Model
 
@@ -123,10 +129,16 @@ class JointProblem:
     groups : tuple of str
     shared : mapping of str to tuple of str
         Parameters that several outputs have in common, and these.
+    wholes : mapping of str to Problem
+        By output, with the rows of all groups.
+    column : str
+        That tells the groups.
     """
 
     priors: Priors
     parts: Mapping[tuple[str, str], Part]
+    wholes: Mapping[str, Problem]
+    column: str = ""
     pooled: tuple[str, ...] = ()
     groups: tuple[str, ...] = ()
     shared: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
@@ -134,20 +146,19 @@ class JointProblem:
     origin: Array = field(default_factory=lambda: np.zeros(0))
 
     def __repr__(self) -> str:
-        rows = sum(len(p.problem.table) for p in self.parts.values())
+        rows = sum(len(whole.table) for whole in self.wholes.values())
         groups = f", {len(self.groups)} groups" if self.groups else ""
         return f"<JointProblem of {', '.join(self.outputs)}: {rows} rows{groups}>"
 
     @property
     def models(self) -> tuple[Model, ...]:
         """The models, by output."""
-        of = {output: part.problem.bound.model for (output, _), part in self.parts.items()}
-        return tuple(of.values())
+        return tuple(whole.bound.model for whole in self.wholes.values())
 
     @property
     def outputs(self) -> tuple[str, ...]:
         """Names of the outputs."""
-        return tuple(dict.fromkeys(output for output, _ in self.parts))
+        return tuple(self.wholes)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -170,8 +181,7 @@ class JointProblem:
 
     def split(self, t: Array) -> tuple[Array, Array, Array]:
         """Return h (k, d_h), groups' values (k, g, q) and ln|L| (k,) of coordinates (k, d)."""
-        d_h, q, n = len(self.priors.free), len(self.pooled), len(self.groups)
-        h, u = t[:, :d_h], t[:, d_h:].reshape(len(t), n, q)
+        (h, u), q, n = self.parted(t), len(self.pooled), len(self.groups)
         if not q:
             return h, u, np.zeros(len(t))
         mean, tau = self._places
@@ -206,18 +216,61 @@ class JointProblem:
 
     def log_prob(self, t: Array) -> Array:
         """Log posterior density (unnormalised) of coordinates (k, d), shape (k,)."""
-        t = np.atleast_2d(t)
-        value = self.priors.log_prob(t[:, : len(self.priors.free)])
-        good = np.isfinite(value)
+        value = np.full(len(t), -np.inf)
+        good = np.isfinite(self.priors.log_prob(t[:, : len(self.priors.free)]))
         with np.errstate(all="ignore"):
             h, theta, ln_size = self.split(t[good])
-            found = value[good] + ln_size + self.log_between(h, theta)
-            for part in self.parts.values():
-                possible = np.isfinite(found)
-                own = part.coordinates(h[possible], theta[possible])
-                found[possible] += part.problem.log_likelihood(own)
-        value[good] = np.where(np.isnan(found), -np.inf, found)
+            value[good] = ln_size + self.log_posterior(h, theta)
+        return np.where(np.isnan(value), -np.inf, value)
+
+    def log_posterior(self, h: Array, theta: Array) -> Array:
+        """Log density of parameters (k, d_h) and groups' values (k, g, q), shape (k,)."""
+        with np.errstate(all="ignore"):
+            value = self.priors.log_prob(h) + self.log_between(h, theta)
+            for i in np.array_split(np.flatnonzero(np.isfinite(value)), self._chunks(len(h))):
+                value[i] += self._log_likelihood(h[i], theta[i]) if i.size else 0.0
+        return np.where(np.isnan(value), -np.inf, value)
+
+    def _chunks(self, vectors: int) -> int:
+        rows = sum(whole.squares.mean.size for whole in self.wholes.values())
+        return 1 + vectors * rows // CHUNK_CELLS
+
+    @cached_property
+    def _together(self) -> tuple[tuple[tuple[str, str], ...], ...]:
+        """Parts whose models have their work in common, and the same parameters and conditions."""
+        found: dict[object, list[tuple[str, str]]] = {}
+        for key, part in self.parts.items():
+            bound, at = part.problem.bound, part.problem.squares.conditions
+            shared = bound.model.whole is not None and part.problem.noise.iid_normal
+            free = part.problem.priors.names
+            columns = part.columns[[n not in _OF_NOISE for n in free]]
+            held = tuple((p.name, p.loc) for p in part.problem.priors.entries if p.fixed)
+            values = tuple(v.tobytes() for v in at.values())
+            same = (bound.model.whole, columns.tobytes(), part.group, held, values)
+            found.setdefault(same if shared else key, []).append(key)
+        return tuple(map(tuple, found.values()))
+
+    def _log_likelihood(self, h: Array, theta: Array) -> Array:
+        """Sum over all parts, of coordinates (k, d_h) and groups' values (k, g, q), shape (k,)."""
+        value = np.zeros(len(h))
+        for keys in self._together:
+            parts, whole = [self.parts[key] for key in keys], None
+            for part in parts:
+                problem, t = part.problem, part.coordinates(h, theta)
+                bound, function = problem.bound, problem.bound.model.whole
+                if function is None or len(parts) == 1:
+                    value += problem.log_likelihood(t)
+                    continue
+                if whole is None:
+                    natural = problem.of_model(problem.theta(t))
+                    whole = bound.call(function, natural, problem.squares.conditions)
+                value += problem.log_likelihood(t, bound.part(whole))
         return value
+
+    def parted(self, t: Array) -> tuple[Array, Array]:
+        """Part vectors (k, d) into parameters (k, d_h) and groups' values (k, g, q)."""
+        d_h = len(self.priors.free)
+        return t[:, :d_h], t[:, d_h:].reshape(len(t), len(self.groups), len(self.pooled))
 
     def about(self, h: Array, theta: Array) -> JointProblem:
         """Return the problem in coordinates about parameters (d_h,) and groups' values (g, q)."""
@@ -341,7 +394,7 @@ def build_joint(
                 problem = whole.with_table(whole.table.take(rows)) if groups else whole
                 place = groups.index(g) if groups else -1
                 parts[output, g] = Part(problem, np.array(columns[output]), place, own)
-    return JointProblem(Priors(tuple(entries)), parts, tuple(pooled), groups, shared)
+    return JointProblem(Priors(tuple(entries)), parts, wholes, group, tuple(pooled), groups, shared)
 
 
 def _labels(table: Table, group: str) -> NDArray[np.str_]:
@@ -422,7 +475,7 @@ class JointCalibration:
     ----------
     problem : JointProblem
     draws : Draws
-        In the coordinates that were sampled, which the convergence criteria judge.
+        In the coordinates of the problem's priors, then groups' values.
     seed : int
     settings : SamplerSettings
     """
@@ -443,8 +496,7 @@ class JointCalibration:
 
     @cached_property
     def _split(self) -> tuple[Array, Array]:
-        h, theta, _ = self.problem.split(self.draws.flat)
-        return h, theta
+        return self.problem.parted(self.draws.flat)
 
     @cached_property
     def parameters(self) -> Mapping[str, Array]:
@@ -497,8 +549,7 @@ class JointCalibration:
         label = f"{output} {group or ''}".strip()
         if group is None and self.problem.groups:
             theta = self._new(h)[:, None]
-            tables = [self.problem.parts[key].problem.table for key in keys]
-            part = replace(part, problem=part.problem.with_table(_stacked(tables)), group=0)
+            part = replace(part, problem=self.problem.wholes[output], group=0)
             label = f"{output} of a new group"
         t = part.coordinates(h, theta).reshape(*self.draws.t.shape[:3], -1)
         report = judge(
@@ -531,14 +582,6 @@ class JointCalibration:
         u = generator(self.seed, "new group").uniform(size=mean.shape)
         a, b = ndtr((low - mean) / sd), ndtr((high - mean) / sd)
         return np.asarray(mean + sd * ndtri(a + u * (b - a)))
-
-
-def _stacked(tables: Sequence[Table]) -> Table:
-    from calib.data import table_from_arrays
-
-    names = [n for n in tables[0] if all(n in t for t in tables)]
-    columns = {n: np.concatenate([t[n] for t in tables]) for n in names}
-    return table_from_arrays(columns, source=tables[0].source)
 
 
 @takes(problem=JointProblem, seed=Integral, settings=SamplerSettings)
@@ -581,11 +624,25 @@ def calibrate_joint(
         problem = _centred(problem, generator(seed, "joint", "centre"))
     chosen = settings or SamplerSettings()
     sources = dict.fromkeys(part.problem.table.source for part in problem.parts.values())
+    priors = problem.priors
+    for part in problem.parts.values():
+        model, conditions = part.problem.bound.model, part.problem.conditions
+        if not isinstance(priors, SumAndRatio):
+            priors = sum_and_ratio(priors, model.joined, conditions)
     draws = sample_joint(
-        problem.log_prob, problem.priors, stream(seed, "joint", "sample"), problem.names, chosen,
+        problem.log_prob, priors, stream(seed, "joint", "sample"), problem.names, chosen,
         where=", ".join(sources), progress=progress,
         dear=any(bool(m.slow or m.uncertain) for m in problem.models),
     )  # fmt: skip
+    if problem.groups:
+
+        def by_group(t: Array) -> Array:
+            h, theta, _ = problem.split(t.reshape(-1, t.shape[-1]))
+            return np.column_stack([h, theta.reshape(len(h), -1)]).reshape(t.shape)
+
+        draws = in_coordinates(draws, by_group, problem.names, chosen.gate)
+        value = problem.log_posterior(*problem.parted(draws.flat))
+        draws = replace(draws, log_prob=value.reshape(draws.t.shape[:-1]))
     return JointCalibration(problem, draws, seed, chosen)
 
 

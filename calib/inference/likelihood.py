@@ -85,11 +85,14 @@ class SumOfSquares:
         """Evaluate natural parameters of the model, (k, d) to (k,); NaN where it has no value."""
 
         def between(some: Array) -> Array:
-            predicted = self.bound.mean_response(some, self.conditions)
-            return np.asarray(np.square(predicted - self.mean) @ self.repeats)
+            return self.about(self.bound.mean_response(some, self.conditions))
 
+        return in_chunks(between, theta, self.mean.size)
+
+    def about(self, predicted: Array) -> Array:
+        """Evaluate predictions (k, m) at the distinct conditions."""
         with np.errstate(all="ignore"):
-            return self.within + in_chunks(between, theta, self.mean.size)
+            return np.asarray(self.within + np.square(predicted - self.mean) @ self.repeats)
 
 
 def log_normal(residuals: Array, variance: Array, curves: Array, sigma: Array) -> Array:

@@ -255,8 +255,11 @@ class Problem:
             error = rng.standard_normal((len(theta), curves.shape[1])) @ curves.T
             return np.asarray(location + np.sqrt(unknown)[:, None] * error)
 
-    def log_likelihood(self, t: Array) -> Array:
-        """Log likelihood of internal coordinates, shape (k,); ``-inf`` where undefined."""
+    def log_likelihood(self, t: Array, predicted: Array | None = None) -> Array:
+        """Log likelihood of internal coordinates, shape (k,); ``-inf`` where undefined.
+
+        `predicted` are mean responses (k, m) that are known, at the conditions of `squares`.
+        """
         natural, model = self.theta(t), self.bound.model
         n, sigma = self.response.size, natural[:, -1]
         # A prior may admit sigma <= 0 or predictions beyond all bounds: they become -inf below.
@@ -267,7 +270,11 @@ class Problem:
                 )
                 value = log_normal(self.response - predicted, unknown, curves, sigma)
             elif self.noise.iid_normal:
-                sse = self.squares(self.of_model(natural))
+                sse = (
+                    self.squares(self.of_model(natural))
+                    if predicted is None
+                    else self.squares.about(predicted)
+                )
                 value = -n * (np.log(sigma) + HALF_LN_2PI) - 0.5 * sse / sigma**2
             else:
                 value = in_chunks(

@@ -205,13 +205,19 @@ def sample_posterior(
     draws = replace(draws, mode=modes[0].t, seconds=time.perf_counter() - began)
     if not isinstance(priors, SumAndRatio):
         return draws
-    # Back in the coordinates of the parameters, draws are judged as well.
-    t, joint = priors.by_parameter(draws.t), draws.report
-    report = judge(t, priors.names, chosen.gate, tau=joint.tau, steps=joint.steps)
-    if not joint.passed:
-        reasons = dict.fromkeys((*joint.reasons, *report.reasons))
+    return in_coordinates(draws, priors.by_parameter, priors.names, chosen.gate)
+
+
+def in_coordinates(
+    draws: Draws, to: Callable[[Array], Array], names: tuple[str, ...], gate: Gate
+) -> Draws:
+    """Return draws in other coordinates, (..., d) to (..., d), where they are judged as well."""
+    t, sampled = to(draws.t), draws.report
+    report = judge(t, names, gate, tau=sampled.tau, steps=sampled.steps)
+    if not sampled.passed:
+        reasons = dict.fromkeys((*sampled.reasons, *report.reasons))
         report = replace(report, passed=False, reasons=tuple(reasons))
-    return replace(draws, t=t, report=report, mode=priors.by_parameter(draws.mode))
+    return replace(draws, t=t, report=report, mode=to(draws.mode))
 
 
 def sample_joint(
@@ -229,13 +235,16 @@ def sample_joint(
 
     The others, if there are any, are nearly independent of them and standard normal. Modes are
     sought, and the prior is carried to the posterior, where these are zero. `dear` is whether an
-    evaluation is, `where` names the data.
+    evaluation is, `where` names the data. With priors in other coordinates (`SumAndRatio`) these
+    are sampled; density and draws are in those by parameter.
     """
     rest = len(names) - len(priors.free)
     few = 64 if dear else 320
     chosen = replace(settings, walkers=settings.walkers or max(few, 2 * (len(names) + 1)))
     walkers, seeds = chosen.n_walkers(len(names)), seed.spawn(1 + chosen.ensembles)
-    rng, count = np.random.default_rng(seeds[0]), _Counter(log_prob)
+    rng = np.random.default_rng(seeds[0])
+    back = priors.by_parameter if isinstance(priors, SumAndRatio) else None
+    count = _Counter(log_prob if back is None else lambda t: log_prob(back(t)))
 
     def of_first(h: Array) -> Array:
         return count(np.column_stack([h, np.zeros((len(h), rest))]))
@@ -244,16 +253,17 @@ def sample_joint(
     if annealed is None:
         raise _nowhere(where)
     annealed = annealed[rng.permutation(len(annealed))]
-    modes = find_modes(of_first, priors, rng, starts=annealed[:24])
+    modes = find_modes(of_first, priors, rng, starts=annealed[:24], spread=16 if dear else 64)
     guesses = [
         Guess(np.append(g.mean, np.zeros(rest)), block_diag(g.cholesky, np.eye(rest)))
         for g in _guesses(modes, annealed)
     ]
     starts = np.column_stack([annealed[:walkers], rng.standard_normal((walkers, rest))])
-    return sample_density(
+    draws = sample_density(
         count, guesses, seeds, names, chosen, rng=rng,
         last_starts=starts if chosen.ensembles >= LEAST_ENSEMBLES else None, progress=progress,
     )  # fmt: skip
+    return draws if back is None else in_coordinates(draws, back, names, chosen.gate)
 
 
 def _from_prior(

@@ -122,6 +122,9 @@ class Model:
         Of a prediction that is known with an error of its own (an emulator's): ``(theta (k, d),
         conditions (n,)) -> prediction (k, n), variance (k,), curves (n, j)`` on the scale of the
         response, the error being the curves times independent normals of that variance.
+    whole : callable, optional
+        What models of several outputs have in common: ``(conditions, **parameters) -> anything``,
+        which `mean_response` then takes as its only argument. A joint fit calls it once for all.
     """
 
     name: str
@@ -153,6 +156,7 @@ class Model:
     joined: tuple[str, str, str] | None = None
     slow: bool = False
     uncertain: Callable[[Array, Conditions], tuple[Array, Array, Array]] | None = None
+    whole: Callable[..., Any] | None = None
     # Whether `predict` takes conditions of each vector's own; None until it was tried.
     _broadcasts: bool | None = field(default=None, init=False, repr=False, compare=False)
 
@@ -234,9 +238,18 @@ class BoundModel:
         with np.errstate(all="ignore"):
             if self.model.mean_response is None:
                 return _predicted(self.model, theta, conditions)
-            named = dict(zip(self.model.parameters, theta.T[:, :, None], strict=True))
-            at = {**conditions, **self.references}
-            return np.asarray(self.model.mean_response(at, **named))
+            if self.model.whole is not None:
+                return self.part(self.call(self.model.whole, theta, conditions))
+            return np.asarray(self.call(self.model.mean_response, theta, conditions))
+
+    def call(self, function: Callable[..., Any], theta: Array, conditions: Conditions) -> Any:
+        """Call a function of conditions, references and parameters by name, (k, 1)."""
+        named = dict(zip(self.model.parameters, theta.T[:, :, None], strict=True))
+        return function({**conditions, **self.references}, **named)
+
+    def part(self, whole: Any) -> Array:
+        """Return the mean response that the model's `whole` holds."""
+        return np.asarray(self.model.mean_response(whole))  # type: ignore[misc]
 
     def predict(self, theta: Array, conditions: Conditions) -> Array:
         """Predict the output in its canonical unit, shape (k, n)."""

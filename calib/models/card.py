@@ -35,6 +35,7 @@ class Equation(NamedTuple):
     to_reported: Callable[..., Parameters] = as_they_are
     from_reported: Callable[..., Parameters] = as_they_are
     bind_references: Callable[[Conditions], dict[str, float]] = no_references
+    whole: Callable[..., Any] | None = None
 
 
 def from_cards(module: str, **equations: Equation) -> tuple[Model, ...]:

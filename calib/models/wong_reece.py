@@ -17,6 +17,7 @@ determines but a few, so what is known of the soil is best fixed in a prior file
 
 from __future__ import annotations
 
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -142,21 +143,13 @@ def contact(
         return Contact(pull, radius * torque, radius * (1.0 - np.cos(entry)))
 
 
-def _pull(x: Conditions, **soil: Array) -> Array:
-    return contact(x, **soil).pull
-
-
-def _torque(x: Conditions, **soil: Array) -> Array:
-    return contact(x, **soil).torque
-
-
-def _ln_sinkage(x: Conditions, **soil: Array) -> Array:
-    return np.asarray(np.log(1000.0 * contact(x, **soil).sinkage))
+def _ln_sinkage(found: Contact) -> Array:
+    return np.asarray(np.log(1000.0 * found.sinkage))
 
 
 MODELS = from_cards(
     "wong_reece",
-    wong_reece_pull=Equation(_pull),
-    wong_reece_torque=Equation(_torque),
-    wong_reece_sinkage=Equation(_ln_sinkage),
+    wong_reece_pull=Equation(attrgetter("pull"), whole=contact),
+    wong_reece_torque=Equation(attrgetter("torque"), whole=contact),
+    wong_reece_sinkage=Equation(_ln_sinkage, whole=contact),
 )
