@@ -27,6 +27,7 @@ from calib.errors import CalibError
 _RECORDS: Mapping[str, tuple[str, ...]] = {
     "manifest.json": (),
     "run.json": (),
+    "joint.json": (),
     "comparison.json": (),
     "diagnosis.json": (
         "document.json", "corrected.json", "fresh_prediction.csv", "inputs.json", "case",

@@ -33,6 +33,7 @@ from calib.checking.folders import (
     DiagnosisRecord,
     check_comparison,
     check_diagnosis,
+    check_joint,
     check_run,
 )
 from calib.checking.tolerances import describe, drawn_in_output
@@ -53,6 +54,7 @@ from calib.inference.io import (
     fault_of,
     read_record,
 )
+from calib.inference.joint_files import JointRecord
 from calib.inference.prior_files import default_priors, inherited_otherwise
 from calib.inference.problem import Problem, build_problem
 from calib.models import get_model
@@ -125,7 +127,7 @@ class Outcome:
     """
 
     folder: str
-    kind: Literal["report", "run", "comparison", "diagnosis"]
+    kind: Literal["report", "run", "comparison", "diagnosis", "joint"]
     quick: bool
     items: tuple[Item, ...]
     environment: Mapping[str, tuple[str, str]]
@@ -199,7 +201,8 @@ def _not_converged(record: Record, folder: Path) -> tuple[str, ...]:
     """
     if isinstance(record, ComparisonRecord):
         return record.unsound
-    gates = {str(record.document.get("model")): inside(record.document, "gate").get("passed")}
+    of = record.document.get("model") or ", ".join(inside(record.document, "outputs"))
+    gates = {str(of): inside(record.document, "gate").get("passed")}
     for found in inside(read_json(folder / SUMMARY), "models").values():
         gates[str(inside(found).get("model"))] = inside(found, "sampling").get("converged")
     missed = [model for model, passed in gates.items() if passed is False]
@@ -211,7 +214,9 @@ def _not_converged(record: Record, folder: Path) -> tuple[str, ...]:
 
 def read_folder(folder: Path) -> Record:
     """Read what a folder says of itself; a CalibError if it is none that can be checked."""
-    kinds: tuple[type[Record], ...] = (Manifest, RunRecord, ComparisonRecord, DiagnosisRecord)
+    kinds: tuple[type[Record], ...] = (
+        Manifest, RunRecord, ComparisonRecord, DiagnosisRecord, JointRecord,
+    )  # fmt: skip
     why = f"no {', '.join(kind.FILE for kind in kinds)} in it"
     for kind in kinds:
         if (folder / kind.FILE).is_file():
@@ -511,5 +516,5 @@ def _check_compared(manifest: Manifest, tasks: Iterable[Task], job: Job) -> list
 
 _CHECKS: Mapping[str, Callable[[Any, Job], list[Item]]] = {
     "report": check_report, "run": check_run, "comparison": check_comparison,
-    "diagnosis": check_diagnosis,
+    "diagnosis": check_diagnosis, "joint": check_joint,
 }  # fmt: skip

@@ -39,6 +39,7 @@ from calib.errors import FAULTS, CalibError
 from calib.gap.document import FILE as GAP_DOCUMENT
 from calib.inference.calibration import moments
 from calib.inference.io import DRAWN, POSTERIOR, RUN, DrawsFile, read_draws, read_netcdf
+from calib.inference.joint_files import JOINT, read_joint_draws
 from calib.inference.problem import Problem
 from calib.models.base import Array
 from calib.report.comparison import FILE as COMPARISON
@@ -147,7 +148,7 @@ def is_document(name: str) -> bool:
     """Whether a file is compared entry by entry."""
     if name.startswith("gaps/"):
         return name.endswith((".json", ".csv")) and not name.endswith(f"/{GAP_DOCUMENT}")
-    return name in (SUMMARY, MANIFEST, AUDIT, COMPARISON, RUN)
+    return name in (SUMMARY, MANIFEST, AUDIT, COMPARISON, RUN, JOINT)
 
 
 def _group_of(place: Place) -> str:
@@ -160,7 +161,7 @@ def _group_of(place: Place) -> str:
     owner = ""
     if file == SUMMARY and keys[:1] == ["models"]:
         owner, keys = f"{keys[1]}: ", keys[2:]
-    elif file != RUN:
+    elif file not in (RUN, JOINT):
         return file if file in (MANIFEST, SUMMARY) else file.partition(".")[0]
     drawn = {"posterior", "prior_sensitivity", "validation", "sampling", "gate", "mode"}
     drawn |= {"log_evidence", "efficiency", "acceptance", "evaluations"}
@@ -182,9 +183,10 @@ def read_entries(folder: Path, name: str) -> dict[Place, Any]:
     if name.endswith("corrected.json"):
         # Its predictions are held against its diagnosis; these by the laboratory's mode are not.
         document = {"lab_mode": inside(document, "lab_mode")}
-    if name == RUN:
+    if name in (RUN, JOINT):
+        read = read_draws if name == RUN else read_joint_draws
         with suppress(*FAULTS):
-            document["posterior"] = summary_of(read_draws(folder / POSTERIOR))
+            document["posterior"] = summary_of(read(folder / POSTERIOR))
     return {place: value for place, value in flatten(document, (name,)) if _is_compared(*place)}
 
 
@@ -202,14 +204,14 @@ def _is_compared(file: str, first: str = "", *more: str) -> bool:
         return False
     # A run's verdict is on rows that were held out as well, which it does not keep.
     own = ("views", "files", "left_out", "sha256")
-    return file not in (MANIFEST, RUN, COMPARISON) or not (
-        first in own or (file == RUN and first == "verdict")
+    return file not in (MANIFEST, RUN, COMPARISON, JOINT) or not (
+        first in own or (file in (RUN, JOINT) and first == "verdict")
     )
 
 
 def count_drawn(made: Path) -> int:
     """Return how many numbers of a folder made again follow from posterior draws."""
-    there = [name for name in (SUMMARY, COMPARISON, RUN) if (made / name).is_file()]
+    there = [name for name in (SUMMARY, COMPARISON, RUN, JOINT) if (made / name).is_file()]
     return sum(is_drawn(place) for name in there for place in read_entries(made, name))
 
 

@@ -27,7 +27,7 @@ from calib.checking.compare import (
     Status,
     claim,
 )
-from calib.checking.tolerances import drawn_in_comparison, drawn_in_run
+from calib.checking.tolerances import drawn_in_comparison, drawn_in_joint, drawn_in_run
 from calib.data import Table
 from calib.data import files as data_files
 from calib.data.files import decoded, inside
@@ -57,6 +57,15 @@ from calib.inference.io import (
     read_record,
     recompute_run,
     run_problem,
+)
+from calib.inference.joint_files import (
+    JOINT,
+    JointRecord,
+    coordinates_of,
+    density_differs,
+    joint_problem,
+    read_joint_draws,
+    recompute_joint,
 )
 from calib.inference.problem import Problem
 from calib.inference.sampler import SamplerSettings
@@ -224,6 +233,32 @@ def _compare_run(record: RunRecord, calibration: Calibration, job: Job) -> list[
     mode = (item for item in items if item.name.startswith(f"{RUN}: mode."))
     wrong = "the posterior mode in run.json does not follow from the data and priors here"
     return items + blame(mode, f"{DATA} or {PRIORS}", wrong)
+
+
+# Joint calibrations
+
+
+def check_joint(record: JointRecord, job: Job) -> list[Item]:
+    """Return what was found in a joint calibration."""
+    items = verify_files(job.folder, JOINT, record.sha256)
+    with compare.not_computed(items, job.folder, JOINT):
+        problem = joint_problem(record, job.folder)
+        for output, whole in problem.wholes.items():
+            label = record.outputs[output].data_label
+            items.append(verify_label(f"{output}.csv", whole.table, label))
+        file = read_joint_draws(job.folder / POSTERIOR)
+        t = coordinates_of(problem, file)
+        wrong = density_differs(problem, t, file, len(t))
+        right = "its draws have the density of data and priors"
+        items.append(claim(POSTERIORS, POSTERIOR, wrong, right))
+        if not job.quick:
+            again = recompute_joint(record, problem, job.made, job.progress)
+            steps = inside(record.document, "gate").get("steps")
+            drawn = drawn_in_joint(again, compare.count_drawn(job.made), steps)
+            sizes = {(JOINT, *path): size for path, size in drawn.items()}
+            items += compare.document(JOINT, job, sizes)
+            items.append(compare.draws(POSTERIOR, job))
+    return items
 
 
 # Comparisons

@@ -26,6 +26,7 @@ import numpy as np
 import scipy
 
 from calib.inference.calibration import Calibration
+from calib.inference.joint import JointCalibration
 from calib.validation.comparison import Comparison
 from calib.validation.scores import Sensitivity
 from calib.validation.validate import (
@@ -79,6 +80,12 @@ def drawn_in_run(calibration: Calibration, n: int, steps: Any) -> Errors:
     return scaled | {("mode", str(j)): sd for j, sd in sds}
 
 
+def drawn_in_joint(calibration: JointCalibration, n: int, steps: Any) -> Errors:
+    """Return the same for a joint calibration, whose evidence is not worked out."""
+    times = multiple(n) * _of_difference(calibration, steps)
+    return _scaled(posterior_errors(calibration), times)
+
+
 def drawn_in_comparison(comparison: Comparison, n: int, steps: Mapping[str, Any]) -> Errors:
     """Return the same for a comparison, by paths below ``models``; `steps` are by model.
 
@@ -108,7 +115,7 @@ def drawn_in_comparison(comparison: Comparison, n: int, steps: Mapping[str, Any]
     return found
 
 
-def _of_difference(calibration: Calibration, steps: Any) -> float:
+def _of_difference(calibration: Calibration | JointCalibration, steps: Any) -> float:
     """Error of the difference of two runs over that of this one, should the other be shorter."""
     known = isinstance(steps, int | float) and steps > 0
     ratio = calibration.draws.report.steps / steps if known else 1.0
@@ -176,35 +183,35 @@ _COMPARED = "comparison.json/models/*"
 # Pattern: parts of a path, * for any; the file first. (a|b) stands for either.
 TABLE: tuple[tuple[str, Tolerance], ...] = (
     # How the work went. Of a posterior with many steps, some are kept: as many as there are steps.
-    (f"({_M}/fit/*/evaluations|{_M}/sampling/gate/smallest_*|run.json/shape/*|"
-     f"({_M}/posterior/*|run.json/gate)/(ess_bulk|ess_tail)(|/*)|"
-     f"({_M}/sampling|run.json|run.json/gate)/(steps|tau|evaluations|efficiency)(|/*))",
+    (f"({_M}/fit/*/evaluations|{_M}/sampling/gate/smallest_*|(run|joint).json/shape/*|"
+     f"({_M}/posterior/*|(run|joint).json/gate)/(ess_bulk|ess_tail)(|/*)|"
+     f"({_M}/sampling|(run|joint).json|(run|joint).json/gate)/(steps|tau|evaluations|efficiency)(|/*))",
      Tolerance(ORDER_OF_MAGNITUDE, 10.0, "ratio")),
     (f"{_M}/posterior/*/mcse_*", Tolerance(ORDER_OF_MAGNITUDE, 5.0, "ratio")),
-    (f"({_M}/posterior/*/rhat|{_M}/sampling/gate/largest_rhat|run.json/gate/rhat/*)",
+    (f"({_M}/posterior/*/rhat|{_M}/sampling/gate/largest_rhat|(run|joint).json/gate/rhat/*)",
      Tolerance(ORDER_OF_MAGNITUDE, 0.01, "one")),
-    (f"({_M}/sampling|run.json)/acceptance", Tolerance(ORDER_OF_MAGNITUDE, 0.1, "one")),
+    (f"({_M}/sampling|(run|joint).json)/acceptance", Tolerance(ORDER_OF_MAGNITUDE, 0.1, "one")),
     (f"({_M}/fit/*/note|audit.json/findings/*/evidence)", Tolerance("words", words=True)),
     # Some from the mode, which stops a little elsewhere.
-    (f"(({_M}/sampling|run.json/gate)/reasons|{_M}/warnings|{_M}/noise/against_normal/sentence)"
+    (f"(({_M}/sampling|(run|joint).json/gate)/reasons|{_M}/warnings|{_M}/noise/against_normal/sentence)"
      "(|/*)", _WORDS),
     # A case that is kept has the names of its own files.
     (f"{_FOUND}/warnings/*", _WORDS),
     # Point estimates
     (f"{_M}/estimates/{_SEARCHES}/*", Tolerance("random search", 1.0, "posterior sd")),
-    (f"({_M}/(estimates/*|sampling/mode)|run.json/(estimates/*/reported|mode))/*",
+    (f"({_M}/(estimates/*|sampling/mode)|(run|joint).json/(estimates/*/reported|mode))/*",
      Tolerance("optimum", 0.005, "posterior sd")),
     (f"{_M}/(fit|by_pressure/*)/{_SEARCHES}/(cost|rmse|r_squared)",
      Tolerance("random search", 1e-3)),
     (f"{_M}/fit/*/(cost|rmse)", Tolerance("arithmetic", 1e-6, "what is left unexplained")),
-    (f"({_M}/by_pressure/*|run.json/estimates)/*/(cost|rmse)",
+    (f"({_M}/by_pressure/*|(run|joint).json/estimates)/*/(cost|rmse)",
      Tolerance("arithmetic", 1e-6, floor=1e-12)),
     (f"{_M}/by_pressure/*/{_SEARCHES}/*", Tolerance("random search", 0.05)),
     (f"{_M}/by_pressure/*/*/*", Tolerance("optimum", 1e-4)),
-    ("run.json/estimates/*/theta/*", Tolerance("optimum", 0.01, floor=1e-6)),
+    ("(run|joint).json/estimates/*/theta/*", Tolerance("optimum", 0.01, floor=1e-6)),
     (f"{_M}/sampling/log_posterior_at_mode", Tolerance("optimum", 1e-5, "one")),
     # What is drawn from posteriors
-    (f"({_M}|run.json)/(posterior/*/(mean|sd|median|hdi_lower|hdi_upper|posterior_to_prior_sd)|"
+    (f"({_M}|(run|joint).json)/(posterior/*/(mean|sd|median|hdi_lower|hdi_upper|posterior_to_prior_sd)|"
      "(sampling/|)log_evidence)", _DRAWN),
     (f"{_M}/validation/(rmse|crps|max_relative_error|elpd|elpd_se|n_relative_error_above_6_percent|"
      "(pit|coverage|coverage_interval)/*)", _DRAWN),

@@ -20,6 +20,7 @@ from calib.cli import (
     export,
     imports,
     interrupted,
+    joint,
     options,
     prediction,
 )
@@ -84,6 +85,7 @@ _COMMANDS: Mapping[str, Mapping[Callable[..., None], str]] = {
     "Everyday": {
         imports.import_: "import run7.xlsx --out my.csv",
         calibration.fit: "fit my.csv --model magic_formula_pressure --out run",
+        joint.joint: "joint plates.csv --model bekker --group bin --pool z_ref --out bins",
         prediction.predict: "predict run --at conditions.csv --out predicted.csv",
         export.export: "export run --at inflation_pressure_psi=30 --out tyre.tir",
         calibration.report: "report my.csv --hold-out inflation_pressure_psi=30 --out report",

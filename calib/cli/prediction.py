@@ -160,6 +160,10 @@ def predict(
             autocompletion=opt.completing("effects"),
         ),
     ] = None,
+    group: Annotated[
+        str | None,
+        typer.Option(help="Group of a joint calibration; without it, a new group is predicted."),
+    ] = None,
     overwrite: opt.Overwrite = False,
     plugins: opt.Models = None,
     simulator: opt.Simulators = None,
@@ -172,6 +176,9 @@ def predict(
         if out.exists():
             _check_replaceable(out, at, overwrite)
         check_room(out)
+    if (run / "joint.json").exists():
+        _predict_joint(run, at, out, group)
+        return
     if (run / "corrected.json").exists():
         _predict_corrected(run, at, out, effects, without or [])
         return
@@ -231,6 +238,21 @@ def predict(
     _give(columns, out, *(p.table for p in problems.values()))
     numbers = {"columns": _numbers(columns)}
     finish(0 if converged else 3, numbers, outside=outside, doubts=list(doubts))
+
+
+def _predict_joint(run: Path, at: Path, out: Path | None, group: str | None) -> None:
+    """Predict every output of a joint calibration, for a group or a new one."""
+    from calib.cli.joint import predicted
+
+    found, table, columns, flags = predicted(run, at, group)
+    if not found.converged:
+        announce("this calibration did not converge; its bands are not to be used")
+        columns["converged"] = ["no"] * len(table)
+    wholes = found.problem.wholes.values()
+    known = {n: v for w in wholes for n, v in w.conditions.items()}
+    outside = _say_outside(table, known, flags)
+    _give(columns, out, *(w.table for w in wholes))
+    finish(0 if found.converged else 3, {"columns": _numbers(columns)}, outside=outside)
 
 
 def _check_replaceable(out: Path, at: Path, overwrite: bool) -> None:

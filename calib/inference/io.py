@@ -100,7 +100,7 @@ class Record(Entry):
     """What a folder of any kind says of itself, in one of its files."""
 
     FILE: ClassVar[str]
-    kind: ClassVar[Literal["report", "run", "comparison", "diagnosis"]]
+    kind: ClassVar[Literal["report", "run", "comparison", "diagnosis", "joint"]]
     WRITTEN_BY: ClassVar[str]
     versions: dict[str, str]
     machine: dict[str, str]
@@ -192,7 +192,7 @@ DRAWN = ("chain", "draw")
 _EMULATOR = "emulator.npz"
 # What `run.json` has of the draws and of the gate's report under their own names.
 _OF_DRAWS = ("log_evidence", "efficiency", "acceptance", "evaluations")
-_OF_GATE = ("rhat", "ess_bulk", "ess_tail", "tau")
+GATE_NUMBERS = ("rhat", "ess_bulk", "ess_tail", "tau")
 
 
 @takes(calibration=Calibration)
@@ -375,7 +375,7 @@ def _describe(calibration: Calibration) -> dict[str, Any]:
             "reasons": list(report.reasons),
             "steps": report.steps,
             "names": list(report.names),
-            **{k: getattr(report, k).tolist() for k in _OF_GATE},
+            **{k: getattr(report, k).tolist() for k in GATE_NUMBERS},
         },
     }
 
@@ -484,7 +484,7 @@ def load_calibration(folder: Path) -> Calibration:
         gate = meta["gate"]
         report = GateReport(
             names=tuple(gate["names"]), steps=gate["steps"], passed=gate["passed"],
-            reasons=tuple(gate["reasons"]), **{k: np.array(gate[k]) for k in _OF_GATE},
+            reasons=tuple(gate["reasons"]), **{k: np.array(gate[k]) for k in GATE_NUMBERS},
         )  # fmt: skip
         draws = Draws(
             t=t, log_prob=log_prob, report=report, mode=np.array(meta["mode"]),

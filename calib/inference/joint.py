@@ -60,6 +60,8 @@ from calib.inference.sampler import (
 from calib.models import get_model
 from calib.models.base import Array, BoundModel, Model
 
+# Ends what a calibration of a group that is not among the data is part of.
+NEW_GROUP = "a new group"
 # What the noise of each output has for itself.
 _OF_NOISE = ("sigma", "nu", "sigma_slope", "rho")
 
@@ -133,12 +135,15 @@ class JointProblem:
         By output, with the rows of all groups.
     column : str
         That tells the groups.
+    labels : mapping of str to ndarray of str
+        By output, the group of each row.
     """
 
     priors: Priors
     parts: Mapping[tuple[str, str], Part]
     wholes: Mapping[str, Problem]
     column: str = ""
+    labels: Mapping[str, NDArray[np.str_]] = field(default_factory=dict)
     pooled: tuple[str, ...] = ()
     groups: tuple[str, ...] = ()
     shared: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
@@ -357,7 +362,7 @@ def build_joint(
             )  # fmt: skip
         wholes[output] = build_problem(name, table, files.get(name))
         if group:
-            labels[output] = _labels(table, group)
+            labels[output] = group_labels(table, group)
     if bool(group) != bool(pooled):
         raise CalibError(
             "groups and pooled parameters belong together", where="build_joint",
@@ -394,11 +399,13 @@ def build_joint(
                 problem = whole.with_table(whole.table.take(rows)) if groups else whole
                 place = groups.index(g) if groups else -1
                 parts[output, g] = Part(problem, np.array(columns[output]), place, own)
-    return JointProblem(Priors(tuple(entries)), parts, wholes, group, tuple(pooled), groups, shared)
+    return JointProblem(
+        Priors(tuple(entries)), parts, wholes, group, labels, tuple(pooled), groups, shared
+    )
 
 
-def _labels(table: Table, group: str) -> NDArray[np.str_]:
-    """Return the group of every row, as text."""
+def group_labels(table: Table, group: str) -> NDArray[np.str_]:
+    """Return the group of every row, as text; a CalibError if there is no such column."""
     if group in table.extra:
         return np.array([cell.strip() for cell in table.extra[group]])
     if group in table.header and len(table.text) == len(table):
@@ -546,11 +553,11 @@ class JointCalibration:
             )
         h, theta = self._split
         part = self.problem.parts[keys[0] if group is None else (output, group)]
-        label = f"{output} {group or ''}".strip()
+        label, new = f"{output} {group or ''}".strip(), ""
         if group is None and self.problem.groups:
             theta = self._new(h)[:, None]
             part = replace(part, problem=self.problem.wholes[output], group=0)
-            label = f"{output} of a new group"
+            label, new = f"{output} of a new group", f", {NEW_GROUP}"
         t = part.coordinates(h, theta).reshape(*self.draws.t.shape[:3], -1)
         report = judge(
             t, part.problem.names, self.settings.gate,
@@ -568,7 +575,7 @@ class JointCalibration:
         joint = f"{', '.join(self.problem.outputs)}"
         if self.problem.groups:
             joint += f" in {len(self.problem.groups)} groups"
-        return Calibration(part.problem, draws, self.seed, label, (), self.settings, joint)
+        return Calibration(part.problem, draws, self.seed, label, (), self.settings, joint + new)
 
     @property
     def outputs(self) -> Mapping[str, Calibration]:

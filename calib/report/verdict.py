@@ -23,8 +23,10 @@ import numpy as np
 
 from calib.arguments import takes
 from calib.data.quantities import output_of, role_of
+from calib.errors import CalibError
 from calib.inference.calibration import Calibration
 from calib.inference.io import RUN
+from calib.inference.joint import NEW_GROUP
 from calib.inference.problem import Problem
 from calib.inference.random import generator
 from calib.models.base import Array
@@ -306,6 +308,13 @@ def verdict(
     'A column explains the residuals'
     """
     output = output_of(calibration.problem.bound.model.output)
+    if calibration.part_of.endswith(NEW_GROUP):
+        raise CalibError(
+            f"{calibration.label} has no rows to judge it by", where="calib.verdict",
+            expected="a calibration of a known group",
+            hint="name a group (`JointCalibration.calibration(output, group)`), and judge new ones "
+            "by rows of a group that was held out (`calib.validate_held_out`)",
+        )  # fmt: skip
     prior = prior_predictive(calibration.problem, generator(calibration.seed, output, "prior"))
     evidence = gather(calibration, validation, prior, loo=loo)
     found = judge_evidence(replace(evidence, emulator_fails=emulator_fails))

@@ -22,6 +22,7 @@ from calib.data.reader import Tabular, index_of
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration
 from calib.inference.diagnostics import mcse, psis, tail_shape
+from calib.inference.joint import JointCalibration
 from calib.inference.problem import Problem
 from calib.inference.random import generator, stream
 from calib.inference.sampler import Progress, SamplerSettings, sample_posterior
@@ -269,7 +270,7 @@ type Errors = dict[Place, float | None]
 """By path; None where a tail is too heavy for one."""
 
 
-def posterior_errors(calibration: Calibration) -> Errors:
+def posterior_errors(calibration: Calibration | JointCalibration) -> Errors:
     """Return the Monte Carlo standard errors of a posterior summary, by paths below the output."""
     names = tuple(calibration.parameters)
     stacked = np.stack([calibration.parameters[name] for name in names], axis=-1)
@@ -287,10 +288,10 @@ def posterior_errors(calibration: Calibration) -> Errors:
             ("posterior", name, "hdi_lower"): max(stated.mcse_hdi_lower, least),
             ("posterior", name, "hdi_upper"): max(stated.mcse_hdi_upper, least),
         }
-    draws = calibration.draws
-    internal = draws.t.reshape(-1, *draws.t.shape[2:])
+    draws, names = calibration.draws, calibration.problem.priors.names
+    internal = draws.t.reshape(-1, *draws.t.shape[2:])[..., : len(names)]
     relative = mcse(internal, "sd") / internal.std(axis=(0, 1))
-    for j, name in enumerate(calibration.problem.names):
+    for j, name in enumerate(names):
         ratio = calibration.summary[name].sd_ratio
         if np.isfinite(ratio):
             errors["posterior", name, "posterior_to_prior_sd"] = ratio * float(relative[j])

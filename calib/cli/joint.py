@@ -1,0 +1,324 @@
+"""The command `joint`, and predictions from its folders."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from calib.cli import options as opt
+from calib.cli.calibration import tell_verdict
+from calib.cli.options import announce, emulate, finish, progress_bars
+from calib.errors import CalibError
+
+if TYPE_CHECKING:
+    from calib.data import Table
+    from calib.inference.emulation import Emulation
+    from calib.inference.joint import JointCalibration, JointProblem
+    from calib.report.verdict import Verdict
+    from calib.validation.validate import Validation
+
+
+def joint(
+    ctx: typer.Context,
+    file: Annotated[Path, typer.Argument(help="CSV whose column names carry units.")],
+    model: Annotated[
+        list[str],
+        typer.Option(
+            "--model", help="A model of each output; repeatable.",
+            autocompletion=opt.completing("models"),
+        ),
+    ],
+    data: Annotated[
+        list[str] | None,
+        typer.Option(help="Other data of a model, MODEL=FILE.csv; repeatable."),
+    ] = None,
+    group: Annotated[
+        str, typer.Option(help="Column whose values tell groups: run, soil bin, tyre, operator.")
+    ] = "",
+    pool: Annotated[
+        list[str] | None,
+        typer.Option(help="Parameter that differs between groups, by partial pooling; repeatable."),
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")] = Path(
+        "calib-joint"
+    ),
+    priors: opt.PriorFiles = None,
+    seed: opt.Seed = 2019,
+    hold_out: Annotated[
+        str | None,
+        typer.Option(
+            "--hold-out",
+            help="Rows kept for validation, e.g. inflation_pressure_psi=30, or groups: bin=C,D.",
+        ),
+    ] = None,
+    overwrite: opt.Overwrite = False,
+    dry_run: opt.DryRun = False,
+    max_steps: opt.MaxSteps = 25_600,
+    workers: opt.Workers = opt.CORES,
+    plugins: opt.Models = None,
+    simulator: opt.Simulators = None,
+    json: opt.Json = False,
+) -> None:  # fmt: skip
+    """Calibrate outputs that share parameters, or groups that are alike, in one posterior."""
+    from functools import partial
+
+    from calib.batch.folders import claimed, fresh_folder
+    from calib.inference.joint import build_joint, calibrate_joint
+    from calib.inference.joint_files import JOINT, save_joint, stated
+    from calib.inference.prior_files import prior_file_model
+    from calib.inference.sampler import SamplerSettings
+
+    ctx.with_resource(claimed(out, overwrite=overwrite))
+    rows = _rows(file, model, data or ())
+    fitted, held = _split(rows, hold_out, group)
+    given = {prior_file_model(path): path for path in priors or ()}
+    build = partial(build_joint, group=group, pooled=pool or (), priors=given)
+    if dry_run:
+        problem = build(fitted)
+        left = {m: len(held[m]) if m in held else 0 for m in model}
+        opt.planned(problem.wholes.values(), left, out)
+        return
+    emulations = emulate({m: (t, given.get(m)) for m, t in fitted.items()}, seed, workers, [])
+    problem = build(fitted)
+    with progress_bars() as tell:
+        found = calibrate_joint(
+            problem, seed, settings=SamplerSettings(max_steps=max_steps),
+            progress=partial(tell, "sampling"),
+        )  # fmt: skip
+    judged, scores = _judged(found, held, hold_out or "", emulations)
+    with fresh_folder(out, overwrite=overwrite) as folder:
+        save_joint(found, folder, verdicts={k: v.document() for k, v in judged.items()})
+    for line in _headlines(problem):
+        print(line)
+    _table(found)
+    gate = found.draws.report
+    if gate.passed:
+        print(f"converged: {gate.steps} steps, R-hat at most {gate.rhat.max():.4f}")
+    else:
+        print(f"NOT CONVERGED, do not use these numbers: {'; '.join(gate.reasons[:3])}")
+    for words in scores.values():
+        print(words["sentence"])
+    for place, one in judged.items():
+        tell_verdict(one, f"{place}: ")
+    for note in dict.fromkeys(n for whole in problem.wholes.values() for n in whole.notes):
+        print(f"note: {note}", file=sys.stderr)
+    print(f"folder: {out}")
+    print(f"next: calib predict {out} --at CONDITIONS.csv")
+    good = found.converged and all(e.passed for e in emulations.values())
+    posterior = stated(found)
+    finish(0 if good else 3, out / JOINT, folder=str(out), posterior=posterior, scores=scores)
+
+
+def _rows(file: Path, models: Sequence[str], data: Sequence[str]) -> dict[str, Table]:
+    """Read the data of each model: those of its own, or of the file."""
+    from calib.data import read_table
+    from calib.data.quantities import OUTPUTS, QUANTITIES
+    from calib.models import get_model
+
+    own = {}
+    for text in data:
+        name, equals, path = text.partition("=")
+        if not equals or name not in models:
+            raise CalibError(
+                f"cannot read --data {text!r}", expected=f"MODEL=FILE.csv, of {', '.join(models)}",
+                hint="name one of the models, an equals sign and its file",
+            )  # fmt: skip
+        own[name] = Path(path)
+    if len(set(models)) < len(models):
+        raise CalibError("a model is there twice", where="--model", hint="name each once")
+    found = {}
+    for name in models:
+        chosen, outputs = get_model(name), set(OUTPUTS.values())
+        # Rows without the output of this model may be those of another.
+        missing = [c for c in QUANTITIES if c not in chosen.conditions or c in outputs]
+        found[name] = read_table(
+            own.get(name, file), required=(*chosen.conditions, chosen.output),
+            allow_missing=missing,
+        )  # fmt: skip
+    return found
+
+
+def _split(
+    rows: Mapping[str, Table], hold_out: str | None, group: str
+) -> tuple[dict[str, Table], dict[str, Table]]:
+    """Return the rows to fit and those held out, by model."""
+    import numpy as np
+
+    from calib.inference.joint import group_labels
+    from calib.report.study import HoldOut
+
+    if hold_out is None:
+        return dict(rows), {}
+    column, _, values = hold_out.partition("=")
+    fitted, held = {}, {}
+    for model, table in rows.items():
+        if group and column.strip() == group:
+            wanted = [value.strip() for value in values.split(",")]
+            labels = group_labels(table, group)
+            if unknown := sorted({*wanted} - {*labels}):
+                raise CalibError(
+                    f"there is no group {', '.join(unknown)}", where=f"--hold-out {hold_out}",
+                    expected=", ".join(sorted({*labels})), hint="name some of these",
+                )  # fmt: skip
+            of = np.isin(labels, wanted)
+            fitted[model], held[model] = (table.take(np.flatnonzero(b)) for b in (~of, of))
+            continue
+        kept = HoldOut.parse(hold_out)
+        fitted[model] = table
+        if kept.applies_to(table):
+            fitted[model], held[model] = kept.split(table)
+    if not held:
+        raise CalibError(
+            "no data have this column", where=f"--hold-out {hold_out}",
+            expected="a column of the data", hint="name a column with its unit, or the groups'",
+        )  # fmt: skip
+    return fitted, held
+
+
+def _headlines(problem: JointProblem) -> list[str]:
+    """Say what the outputs share, and what differs between groups."""
+    found = []
+    if len(problem.outputs) > 1:
+        shared = ", ".join(problem.shared) or "no parameter: each could be fitted by itself"
+        found.append(f"{', '.join(problem.outputs)} share {shared}")
+    if problem.groups:
+        found.append(
+            f"{', '.join(problem.pooled)} may differ between {len(problem.groups)} groups "
+            f"({problem.column})"
+        )
+    return found
+
+
+def _table(found: JointCalibration) -> None:
+    """Print the joint posterior."""
+    from rich.table import Table as RichTable
+
+    from calib.report.numbers import centre_text, interval_text
+
+    rows = sum(len(whole.table) for whole in found.problem.wholes.values())
+    table = RichTable(title=f"joint posterior of {rows} readings")
+    for heading in ("parameter", "unit"):
+        table.add_column(heading)
+    for heading in ("mean ± sd or median", "95 % HDI", "ESS bulk/tail", "R-hat"):
+        table.add_column(heading, justify="right")
+    table.add_column("in")
+    for s in found.summary.values():
+        ess = f"{s.ess_bulk:.0f}/{s.ess_tail:.0f}"
+        numbers = (centre_text(s), interval_text(s), ess, f"{s.rhat:.3f}")
+        table.add_row(s.name, s.unit, *numbers, ", ".join(found.problem.shared.get(s.name, ())))
+    opt.wide_console(120).print(table)
+
+
+def _judged(
+    found: JointCalibration, held: Mapping[str, Table], hold_out: str,
+    emulations: Mapping[str, Emulation],
+) -> tuple[dict[str, Verdict], dict[str, Mapping[str, Any]]]:  # fmt: skip
+    """Judge every output and group, and score rows held out, or left out one by one.
+
+    Rows of a group that was not fitted are those of a new one, which has a score and no verdict.
+    """
+    from calib.report.study import validated
+    from calib.report.verdict import verdict
+    from calib.validation.validate import validate_held_out
+
+    aside = _by_place(held, found.problem.column)
+    judged, scores = dict[str, "Verdict"](), dict[str, Mapping[str, Any]]()
+    for output, group in found.problem.parts:
+        of, place = found.calibration(output, group or None), f"{output} {group}".strip()
+        own = aside.pop((output, group), None)
+        emulation = emulations.get(of.problem.bound.model.name)
+        validation = validated(of, own)
+        reasons = () if emulation is None else emulation.reasons
+        said = "" if own is None else hold_out
+        judged[place] = verdict(of, validation, emulator_fails=reasons, held_out=said)
+        if validation is not None:
+            how = "left out one by one" if own is None else "held out"
+            scores[place] = _score(validation, f"{place}, {how}")
+    for (output, group), rows in aside.items():
+        validation = validate_held_out(found.calibration(output), rows)
+        place = f"{output} {group}".strip()
+        scores[place] = _score(validation, f"{place}, held out as a new group")
+    return judged, scores
+
+
+def _by_place(held: Mapping[str, Table], column: str) -> dict[tuple[str, str], Table]:
+    """Return held-out rows by output and group."""
+    import numpy as np
+
+    from calib.data.quantities import output_of
+    from calib.inference.joint import group_labels
+    from calib.models import get_model
+
+    found = {}
+    for model, table in held.items():
+        measured = get_model(model).output
+        rows = table.take(np.flatnonzero(np.isfinite(table[measured])))
+        labels = group_labels(rows, column) if column else np.full(len(rows), "")
+        for label in sorted({*labels.tolist()}):
+            of = rows.take(np.flatnonzero(labels == label))
+            found[output_of(measured), label] = of
+    return found
+
+
+def _score(validation: Validation, what: str) -> Mapping[str, Any]:
+    from calib.report.numbers import format_number
+
+    scores, ninety = validation.scores, validation.scores.coverage[0.9]
+    return {
+        "rows": ninety.n, "covered_90": ninety.hits, "rmse": scores.rmse, "crps": scores.crps,
+        "sentence": f"{what}: 90 % band covers {ninety.hits} of {ninety.n}, "
+        f"RMSE {format_number(scores.rmse)}, CRPS {format_number(scores.crps)}",
+    }  # fmt: skip
+
+
+def _doubts(run: Path, label: str | None) -> list[str]:
+    """Return the warnings of the verdicts that a folder keeps: of a group, or of all."""
+    from calib.data.files import read_json
+    from calib.inference.joint_files import JOINT
+    from calib.report.verdict import Verdict
+
+    kept: Mapping[str, Any] = read_json(run / JOINT).get("verdict", {})
+    of = {k: v for k, v in kept.items() if label is None or k.endswith(f" {label}")}
+    said = (f"{place}: {w}" for place, v in of.items() for w in Verdict.of(v).warnings)
+    return list(dict.fromkeys(said))
+
+
+def predicted(
+    run: Path, at: Path, label: str | None
+) -> tuple[JointCalibration, Table, dict[str, Any], Sequence[Sequence[str]]]:
+    """Predict all outputs of a joint folder, for a group or a new one.
+
+    Returns the calibration, the table of conditions, columns of a CSV, and what is outside.
+    """
+    from calib.data import read_for_model
+    from calib.data.checks import check_conditions
+    from calib.inference.joint_files import load_joint
+    from calib.validation.prediction import band_columns, echoed, predict
+
+    found = load_joint(run)
+    for doubt in _doubts(run, label):
+        announce(doubt)
+    wholes = found.problem.wholes
+    table = read_for_model(
+        at, list(dict.fromkeys(c for w in wholes.values() for c in w.bound.model.conditions))
+    )
+    known = {n: v for w in wholes.values() for n, v in w.conditions.items()}
+    check_conditions(table, known)
+    columns: dict[str, Any] = dict(echoed(table, *(w.bound.model.output for w in wholes.values())))
+    flags: list[dict[str, None]] = [{} for _ in range(len(table))]
+    notes: list[dict[str, None]] = [{} for _ in range(len(table))]
+    for output in wholes:
+        prediction = predict(found.calibration(output, label), table)
+        banded = band_columns(prediction)
+        columns |= {n: v for n, v in banded.items() if n != "outside_calibrated_range"}
+        for row, note, names, text in zip(
+            flags, notes, prediction.outside, banded["outside_calibrated_range"], strict=True
+        ):
+            row.update(dict.fromkeys(names))
+            note.update(dict.fromkeys([text] if text else []))
+    columns["outside_calibrated_range"] = ["; ".join(map(str, note)) for note in notes]
+    return found, table, columns, [tuple(row) for row in flags]
