@@ -79,6 +79,10 @@ def priors(
         Path | None,
         typer.Option(help="Tyre property file to put the priors of magic_formula about."),
     ] = None,
+    from_run: Annotated[
+        Path | None,
+        typer.Option(help="Run of another model on the same soil, whose posterior is the prior."),
+    ] = None,
     plugins: opt.Models = None,
     simulator: opt.Simulators = None,
 ) -> None:
@@ -87,6 +91,12 @@ def priors(
     from calib.models import get_model
 
     name = get_model(model).name
+    if from_run is not None:
+        from calib import load_calibration
+        from calib.inference.prior_files import priors_from_posterior
+
+        _emit(priors_from_posterior(name, load_calibration(from_run), from_run.name), out)
+        return
     if from_tir is None:
         _emit(default_priors(name).read_text(encoding="utf-8"), out)
         return

@@ -225,7 +225,7 @@ def _judged(
     from calib.report.verdict import verdict
     from calib.validation.validate import validate_held_out
 
-    aside = _by_place(held, found.problem.column)
+    aside = _by_place(held, found.problem)
     judged, scores = dict[str, "Verdict"](), dict[str, Mapping[str, Any]]()
     for output, group in found.problem.parts:
         of, place = found.calibration(output, group or None), f"{output} {group}".strip()
@@ -245,22 +245,22 @@ def _judged(
     return judged, scores
 
 
-def _by_place(held: Mapping[str, Table], column: str) -> dict[tuple[str, str], Table]:
+def _by_place(held: Mapping[str, Table], problem: JointProblem) -> dict[tuple[str, str], Table]:
     """Return held-out rows by output and group."""
     import numpy as np
 
-    from calib.data.quantities import output_of
     from calib.inference.joint import group_labels
-    from calib.models import get_model
 
     found = {}
-    for model, table in held.items():
-        measured = get_model(model).output
-        rows = table.take(np.flatnonzero(np.isfinite(table[measured])))
-        labels = group_labels(rows, column) if column else np.full(len(rows), "")
+    for output, whole in problem.wholes.items():
+        model = whole.bound.model
+        if model.name not in held:
+            continue
+        table = held[model.name]
+        rows = table.take(np.flatnonzero(np.isfinite(table[model.output])))
+        labels = group_labels(rows, problem.column) if problem.column else np.full(len(rows), "")
         for label in sorted({*labels.tolist()}):
-            of = rows.take(np.flatnonzero(labels == label))
-            found[output_of(measured), label] = of
+            found[output, label] = rows.take(np.flatnonzero(labels == label))
     return found
 
 
@@ -290,31 +290,48 @@ def _doubts(run: Path, label: str | None) -> list[str]:
 def predicted(
     run: Path, at: Path, label: str | None
 ) -> tuple[JointCalibration, Table, dict[str, Any], Sequence[Sequence[str]]]:
-    """Predict all outputs of a joint folder, for a group or a new one.
+    """Predict the outputs whose conditions are there, for a group or a new one.
 
     Returns the calibration, the table of conditions, columns of a CSV, and what is outside.
     """
-    from calib.data import read_for_model
+    import numpy as np
+
+    from calib.data import read_table
     from calib.data.checks import check_conditions
+    from calib.data.quantities import QUANTITIES
     from calib.inference.joint_files import load_joint
     from calib.validation.prediction import band_columns, echoed, predict
 
     found = load_joint(run)
     for doubt in _doubts(run, label):
         announce(doubt)
-    wholes = found.problem.wholes
-    table = read_for_model(
-        at, list(dict.fromkeys(c for w in wholes.values() for c in w.bound.model.conditions))
-    )
+    table = read_table(at, allow_missing=[*QUANTITIES])
+    wholes = {
+        output: w for output, w in found.problem.wholes.items()
+        if all(c in table and np.isfinite(table[c]).all() for c in w.bound.model.conditions)
+    }  # fmt: skip
+    if not wholes:
+        raise CalibError(
+            "the conditions of no output are there, whole", where=str(at),
+            expected="; or ".join(
+                f"for {output} {', '.join(w.bound.model.conditions)}"
+                for output, w in found.problem.wholes.items()
+            ),
+            hint="add columns, or fill empty cells",
+        )  # fmt: skip
     known = {n: v for w in wholes.values() for n, v in w.conditions.items()}
     check_conditions(table, known)
     columns: dict[str, Any] = dict(echoed(table, *(w.bound.model.output for w in wholes.values())))
     flags: list[dict[str, None]] = [{} for _ in range(len(table))]
     notes: list[dict[str, None]] = [{} for _ in range(len(table))]
+    done = set[str]()
     for output in wholes:
         prediction = predict(found.calibration(output, label), table)
         banded = band_columns(prediction)
-        columns |= {n: v for n, v in banded.items() if n != "outside_calibrated_range"}
+        # The sinkage of a wheel and of a plate have one name.
+        prefix = f"{output}." if prediction.output in done else ""
+        done.add(prediction.output)
+        columns |= {prefix + n: v for n, v in banded.items() if n != "outside_calibrated_range"}
         for row, note, names, text in zip(
             flags, notes, prediction.outside, banded["outside_calibrated_range"], strict=True
         ):

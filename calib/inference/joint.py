@@ -325,7 +325,8 @@ def build_joint(
     ----------
     models : mapping of str to Table, mapping or pandas.DataFrame
         Models by name, each with its data, which may be the same for several. Rows without a
-        model's output are not used for it.
+        model's output are not used for it. Where several models predict one quantity, such as the
+        sinkage of a wheel and of a plate, their outputs have the names of the models.
     group : str, optional
         A column of the data: rows of one value are of one group.
     pooled : sequence of str, optional
@@ -336,9 +337,9 @@ def build_joint(
     Raises
     ------
     CalibError
-        As of `calib.build_problem`; if two models predict one output, a parameter that outputs
-        share has two priors, a column or parameter is not there, or there are fewer than three
-        groups.
+        As of `calib.build_problem`; if two models predict the same readings, a parameter that
+        outputs share has two priors, a column or parameter is not there, or there are fewer than
+        three groups.
 
     Examples
     --------
@@ -349,18 +350,25 @@ def build_joint(
     >>> joint.names[:4]
     ('z_ref', 'n0', 'n1', 'sigma')
     """
-    files, wholes, labels = dict(priors or {}), {}, {}
-    for name, data in models.items():
-        model, table = get_model(name), as_table(data, allow_missing=tuple(OUTPUTS.values()))
-        table.must_have(model.output)
-        table = table.take(np.flatnonzero(np.isfinite(table[model.output])))
-        output = output_of(model.output)
-        if output in wholes:
+    files, labels = dict(priors or {}), {}
+    wholes: dict[str, Problem] = {}
+    tables = {name: _measured(get_model(name).output, data) for name, data in models.items()}
+    readings = sum(map(len, tables.values()))
+    columns_of = [get_model(name).output for name in tables]
+    for name, table in tables.items():
+        column, others = get_model(name).output, readings - len(table)
+        # The sinkage of a wheel and that of a plate are two outputs.
+        output = output_of(column) if columns_of.count(column) == 1 else name
+        if any(
+            w.bound.model.output == column and np.array_equal(w.observed, table[column])
+            for w in wholes.values()
+        ):
             raise CalibError(
-                f"two models predict {output}", where="build_joint",
-                expected="one model for each output", hint="compare them (`calib.compare`)",
+                f"two models predict the same readings of {output_of(column)}",
+                where="build_joint", expected="readings of its own for each model",
+                hint="compare them (`calib.compare`)",
             )  # fmt: skip
-        wholes[output] = build_problem(name, table, files.get(name))
+        wholes[output] = build_problem(name, table, files.get(name), others=others)
         if group:
             labels[output] = group_labels(table, group)
     if bool(group) != bool(pooled):
@@ -402,6 +410,13 @@ def build_joint(
     return JointProblem(
         Priors(tuple(entries)), parts, wholes, group, labels, tuple(pooled), groups, shared
     )
+
+
+def _measured(column: str, data: Tabular) -> Table:
+    """Return the rows that have an output."""
+    table = as_table(data, allow_missing=tuple(OUTPUTS.values()))
+    table.must_have(column)
+    return table.take(np.flatnonzero(np.isfinite(table[column])))
 
 
 def group_labels(table: Table, group: str) -> NDArray[np.str_]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from importlib import resources
 from pathlib import Path, PurePath
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
@@ -21,8 +21,12 @@ from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError, in_words, meant
 from calib.inference.likelihood import DEFAULT_PRIORS, IID_NORMAL, Along, Family, Noise
 from calib.inference.priors import Prior, Priors
-from calib.models import MODELS
+from calib.models import MODELS, get_model
+from calib.models.base import same_unit
 from calib.models.simulators.declaration import written
+
+if TYPE_CHECKING:
+    from calib.inference.calibration import Calibration
 
 # Beyond these, squares and products of numbers leave the range of double precision; no quantity of
 # the field comes near them. An sd of 20 on the logarithm is a factor of 5e8 to either side.
@@ -365,6 +369,63 @@ def whole_text(path: PriorFile, model_name: str) -> str:
         _parsed(whole)  # an inline table of parameters takes no more of them
         return whole if tables else text
     return text
+
+
+def priors_from_posterior(model_name: str, calibration: Calibration, run: str) -> str:
+    """Return a prior file that sets what a posterior says of a model's parameters.
+
+    Those of the same name, unit and meaning, each by itself: the posterior's correlations are lost,
+    so the prior is wider than the posterior. The family is that of the model's own prior.
+
+    Parameters
+    ----------
+    model_name : str
+    calibration : Calibration
+        Of another model, whose sampled and published parameters are looked at.
+    run : str
+        What its run is called.
+
+    Raises
+    ------
+    CalibError
+        If the posterior did not converge, or says nothing of any parameter.
+    """
+    other, model = calibration.problem.bound.model, get_model(model_name)
+    entries = _parsed(_text(default_priors(model_name)))["parameters"]
+    if not calibration.converged:
+        raise CalibError(
+            "the posterior did not converge, and is no prior", where=run,
+            expected="a run that converged", hint="raise --max-steps, and fit again",
+        )  # fmt: skip
+    found = []
+    for name, entry in entries.items():
+        summary = calibration.summary.get(name)
+        if summary is None or name == "sigma" or not same_unit(summary.unit, entry["unit"]):
+            continue
+        if model.meanings.get(name) != other.meanings.get(name):
+            continue
+        draws = calibration.parameters[name]
+        if entry["dist"] == "lognormal" and (draws > 0.0).all():
+            logs = np.log(draws)
+            about = {"median": float(np.exp(logs.mean())), "sd_log": float(logs.std())}
+        else:
+            about = {"mean": float(draws.mean()), "sd": float(draws.std())}
+        kind = "lognormal" if "median" in about else "normal"
+        bounds = {k: entry[k] for k in ("lower", "upper") if k in entry}
+        if kind != entry["dist"]:
+            bounds.setdefault("lower", 0.0)  # a logarithm has values above it only
+        rows = len(calibration.problem.table)
+        said = {"reason": f"Posterior of {other.name} on {rows} rows", "source": run}
+        numbers = {k: float(f"{v:.6g}") for k, v in about.items()}
+        whole = {"dist": kind, **numbers, **bounds, "unit": entry["unit"], **said}
+        found.append(written(name, whole))
+    if not found:
+        raise CalibError(
+            f"{other.name} has no parameter of {model_name}: none of the same name, unit and "
+            "meaning", where=run, expected=f"some of {', '.join(entries)}",
+            hint="compare their parameters (`calib models`)",
+        )  # fmt: skip
+    return "\n".join([f'model = "{model_name}"', "", *found])
 
 
 def _inherited(text: str) -> dict[str, Any]:

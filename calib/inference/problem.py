@@ -347,6 +347,7 @@ def build_problem(
     prior_path: PriorFile | str | None = None,
     *,
     fixed: Mapping[str, float] | None = None,
+    others: int = 0,
 ) -> Problem:
     """Bind a model to data and read its priors.
 
@@ -361,6 +362,8 @@ def build_problem(
         default; `notes` of the problem then says which.
     fixed : mapping of str to float, optional
         Natural parameters to hold at a value.
+    others : int, optional
+        Readings of other outputs that are fitted with these rows and count as well.
 
     Raises
     ------
@@ -389,7 +392,8 @@ def build_problem(
     )
     # With some parameters held, a fit still needs more rows than its equation has parameters.
     estimated = {p.name for p in priors.free} - {*(fixed or ())}
-    check_enough(table, max(len(estimated), len(model.parameters)), model=model.name)
+    least = max(len(estimated), len(model.parameters))
+    check_enough(table, max(least - others, 2), model=model.name)
     check_varies(table, model.output)
     check_settings(table, model.conditions)
     relative = relative_columns(priors.text)

@@ -464,7 +464,7 @@ def _check_priors(model: Model) -> None:
         wanted |= {name: unit for name, unit in model.reported.items() if name in model.parameters}
     for name, unit in wanted.items():
         found = given[name].get("unit") if isinstance(given[name], dict) else None
-        if found is not None and not _same_unit(str(found), unit):
+        if found is not None and not same_unit(str(found), unit):
             unit = unit.replace("**", "^").replace("dimensionless", "1")
             raise CalibError(
                 f"the unit is {found!r}",
@@ -474,7 +474,8 @@ def _check_priors(model: Model) -> None:
             )
 
 
-def _same_unit(found: str, wanted: str) -> bool:
+def same_unit(found: str, wanted: str) -> bool:
+    """Whether two units, as prior files write them, are one."""
     pair = [("dimensionless" if u == "1" else u).replace("^", "**") for u in (found, wanted)]
     try:
         return pair[0] == pair[1] or float(convert(1.0, *pair)) == 1.0

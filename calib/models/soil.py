@@ -160,6 +160,11 @@ def _reece(x: Conditions, z_ref: Array, n: Array, share: Array) -> Array:
     return np.asarray(np.log(z_ref * wider) + (_ln_pressure(x) - stiffer) / n)
 
 
+def _reece_plate(x: Conditions, k1: Array, k2: Array, n: Array) -> Array:
+    width = x[WIDTH] / 1000.0
+    return np.asarray(np.log(x[WIDTH]) + (np.log(x[PRESSURE]) - np.log(k1 + k2 * width)) / n)
+
+
 def _lyasko(x: Conditions, z_ref: Array, n: Array, a: Array) -> Array:
     slip = x["slip_ratio"]
     deeper = np.log((1.0 + slip) / (1.0 - a * slip))
@@ -220,5 +225,6 @@ MODELS = from_cards(
     modified_bekker=Equation(_modified_bekker, _k_of, _z_ref_of, _sinkage_references),
     bekker_plate=Equation(_bekker_plate, _plate_published, _plate_sampled, _sinkage_references),
     reece=Equation(_reece, _reece_published, _reece_sampled, _sinkage_references),
+    reece_plate=Equation(_reece_plate),
     lyasko=Equation(_lyasko, _k_of, _z_ref_of, _sinkage_references),
 )

@@ -213,7 +213,7 @@ def test_what_cannot_be_grouped_is_refused(change: dict[str, object], said: str)
 
 def test_two_models_of_one_output_and_two_priors_of_one_parameter_are_refused(tmp_path) -> None:
     data = two_outputs()
-    with pytest.raises(CalibError, match="two models predict drawbar_pull"):
+    with pytest.raises(CalibError, match="two models predict the same readings of drawbar_pull"):
         build_joint({"pull_line": data, "known_line": data})
     mine = tmp_path / "mine.toml"
     mine.write_text('model = "pull_line"\n[parameters.a]\ndist = "normal"\nmean = 0.0\nsd = 1.0\n'

@@ -142,6 +142,7 @@ def scalar_janosi_hanamoto(p, c):
 SCALAR = {
     "bekker_plate": scalar_bekker_plate,
     "reece": scalar_reece,
+    "reece_plate": scalar_reece,
     "lyasko": scalar_lyasko,
     "wismer_luth": scalar_wismer_luth,
     "brixius": scalar_brixius,
