@@ -149,7 +149,17 @@ class Tree:
             "calib import, 100,000 rows of 8 columns": Command(
                 [*_CALIB, "import", *_log(self.scratch), "--overwrite",
                  "--out", f"{self.scratch}/imported.csv"], asked=5.0,
-                ends=(0,) if (self.root / "calib" / "imports").is_dir() else (2,),
+                ends=self.ends("imports"),
+            ),
+            "calib joint, three outputs of a wheel: 60 readings, 11 parameters": Command(
+                [*_CALIB, "joint", _wheel(self.scratch), *_models("pull", "torque", "sinkage"),
+                 "--out", f"{self.scratch}/wheel", "--overwrite"], 3, asked=30.0,
+                ends=self.ends("cli/joint.py"),
+            ),
+            "calib joint, 12 groups of 20 rows, two pooled parameters": Command(
+                [*_CALIB, "joint", _groups(self.scratch), "--model", "bekker", "--group", "bin",
+                 "--pool", "z_ref", "--pool", "n", "--out", f"{self.scratch}/groups",
+                 "--overwrite"], 3, asked=60.0, ends=self.ends("cli/joint.py"),
             ),
             "calib fit": Command(
                 [*_CALIB, "fit", pulls, "--model", "magic_formula_pressure", "--hold-out",
@@ -168,6 +178,10 @@ class Tree:
                 raise SystemExit("no line of `make test` in the Makefile")
             found["make test"] = Command(line[1].split(), 1, 300.0, ends=(0, 1))
         return found
+
+    def ends(self, part: str) -> tuple[int, ...]:
+        """How a command ends that needs a part of the code, which this state may not have."""
+        return (0,) if (self.root / "calib" / part).exists() else (2,)
 
     def makefile(self) -> str:
         """Return its Makefile."""
@@ -190,6 +204,47 @@ def _log(folder: Path) -> list[str]:
     np.savetxt(path, table, "%.4f", ",", header=",".join(columns))
     path.with_suffix(".toml").write_text(f'[columns]\n{mapping}[thin]\nevery = "auto"\n')
     return [str(path), "--mapping", str(path.with_suffix(".toml"))]
+
+
+def _models(*parts: str) -> list[str]:
+    return [word for part in parts for word in ("--model", f"wong_reece_{part}")]
+
+
+def _wheel(folder: Path) -> str:
+    """Write pull, torque and sinkage of a rigid wheel at two loads, 20 rows."""
+    import numpy as np
+
+    from calib.models.wong_reece import contact
+
+    n, rng = 20, np.random.default_rng(SEED)
+    x = {
+        "slip_ratio": np.tile(np.linspace(0.05, 0.6, n // 2), 2),
+        "normal_load_kn": np.repeat([0.08, 0.16], n // 2),
+        "tyre_width_m": np.full(n, 0.15), "tyre_diameter_m": np.full(n, 0.3),
+    }  # fmt: skip
+    soil = {"k1": 5.0, "k2": 1200.0, "n": 1.0, "c": 0.8, "phi": 30.0, "K": 12.0}
+    found = contact(x, **{k: np.array([[v]]) for k, v in {**soil, "c1": 0.35, "c2": 0.3}.items()})
+    x["drawbar_pull_kn"] = found.pull[0] + 0.003 * rng.standard_normal(n)
+    x["driving_torque_knm"] = found.torque[0] + 0.0004 * rng.standard_normal(n)
+    x["rut_depth_mm"] = 1000.0 * found.sinkage[0] * np.exp(0.05 * rng.standard_normal(n))
+    path = folder / "wheel.csv"
+    np.savetxt(path, np.column_stack([*x.values()]), "%.6g", ",", header=",".join(x), comments="")
+    return str(path)
+
+
+def _groups(folder: Path) -> str:
+    """Write sinkages in twelve bins, 20 rows each."""
+    import numpy as np
+
+    rng, lines = np.random.default_rng(SEED), ["average_ground_pressure_kpa,rut_depth_mm,bin"]
+    for i in range(12):
+        z, n = 20.0 * np.exp(0.3 * rng.standard_normal()), np.exp(0.2 * rng.standard_normal())
+        for p in np.linspace(40.0, 200.0, 20):
+            depth = z * (p / 100.0) ** (1.0 / n) * np.exp(0.06 * rng.standard_normal())
+            lines.append(f"{p:.6g},{depth:.6g},bin {i + 1}")
+    path = folder / "groups.csv"
+    path.write_text("\n".join(lines) + "\n")
+    return str(path)
 
 
 _MEASURED = ("clock", "processor", "exit_codes")
