@@ -25,6 +25,8 @@ import numpy as np
 from calib.models.base import Array, Conditions
 from calib.models.card import Equation, from_cards
 
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
+
 
 class Contact(NamedTuple):
     """Where a wheel stands: pull (kN), torque (kN m) and sinkage (m), each (k, n)."""
@@ -63,8 +65,7 @@ def _forces(entry: Array, wheels: _Wheels) -> tuple[Array, Array, Array]:
     the root of that distance, in which Gauss and Legendre's rule is taken: 8 nodes on either half
     leave about 1e-6 of the load.
     """
-    u, weight = np.polynomial.legendre.leggauss(8)
-    u, weight = (v.reshape(-1, *[1] * entry.ndim) for v in (0.5 * (u + 1.0), weight))
+    u, weight = (v.reshape(-1, *[1] * entry.ndim) for v in (0.5 * (_NODES + 1.0), _WEIGHTS))
     node, weight = u * u, weight * u
     sin_entry, cos_entry = np.sin(entry), np.cos(entry)
     rear = wheels.turn * entry
