@@ -256,7 +256,7 @@ def predict(
     columns, everywhere = asked.columns(columns, {prediction.output: prediction}, given, out)
     if not converged:
         columns["converged"] = ["no"] * len(given)
-    outside = _say_outside(read, known, columns["outside_calibrated_range"])
+    outside = _say_outside(read, known, columns)
     undefined = int((prediction.defined < MIN_DEFINED).sum())
     if undefined:
         why = f": the model has none there for much of the {'posterior' if stack else 'prior'}"
@@ -331,18 +331,20 @@ def _predict_corrected(
             f"no value (nan) at {nowhere} of {len(table)} rows: the simulator has none there, or "
             "explanations differ too much"
         )
-    found = {OUTPUTS[o]: prediction.draws(OUTPUTS[o]) for o in corrected.data.names}
+    outputs = map(OUTPUTS.__getitem__, corrected.data.names if asked.anything else ())
+    found = {column: prediction.draws(column) for column in outputs}
     columns, everywhere = asked.columns(columns, found, given, out)
-    outside = _say_outside(read, covered(corrected, read), columns["outside_calibrated_range"])
+    outside = _say_outside(read, covered(corrected, read), columns)
     _give(columns, out, corrected.data.case.lab, corrected.data.case.field)
     numbers = {"columns": _numbers(columns)} | ({"everywhere": everywhere} if everywhere else {})
     finish(0, numbers, outside=outside)
 
 
-def _say_outside(table: Table, known: Mapping[str, Any], flags: Sequence[str]) -> int:
+def _say_outside(table: Table, known: Mapping[str, Any], columns: Mapping[str, Any]) -> int:
     """Warn of rows outside the calibrated range; return how many there are."""
     from calib.data.checks import beyond_notes
 
+    flags = columns["outside_calibrated_range"]
     outside = sum(bool(flag.partition(" (no value")[0]) for flag in flags)
     if outside:
         lie = "row lies" if outside == 1 else "rows lie"

@@ -75,6 +75,11 @@ class Asked:
             raise CalibError(found, hint="ask one after the other")
         return cls(limits, levels, draws, over or "")
 
+    @property
+    def anything(self) -> bool:
+        """Whether there are questions at all."""
+        return bool(self.limits or self.quantiles or self.draws or self.over)
+
     def rows(self, table: Table) -> tuple[Table, Table]:
         """Return the rows to answer for, and those to predict at: curves, if a peak is sought."""
         import numpy as np

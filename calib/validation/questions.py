@@ -147,7 +147,7 @@ class Peak:
     output : Sample, shape (size, m)
         The largest mean output.
     inside : Chance, shape (m,)
-        That the peak is not at an end of the rows, where the output may still rise beyond.
+        That the peak is not at an end of the rows, beyond which the output may still rise.
     """
 
     conditions: Mapping[str, Array]
@@ -252,9 +252,10 @@ def _vertices(x: Array, y: Array) -> tuple[Array, Array, Array]:
     left, right = (y1 - y0) / (x1 - x0), (y2 - y1) / (x2 - x1)
     bend = (right - left) / (x2 - x0)
     slope = left + bend * (x1 - x0)
-    inside = best == middle
     with np.errstate(invalid="ignore", divide="ignore"):
-        step = np.where(inside & (bend < 0.0), -0.5 * slope / bend, 0.0)
+        step = np.where(bend < 0.0, -0.5 * slope / bend, 0.0)
+    # Of a curve that is highest at an end the vertex may lie just before it.
+    inside = (best == middle) | ((bend < 0.0) & (x1 + step > x[0]) & (x1 + step < x[-1]))
     at = np.where(inside, x1 + step, x[best])
     top = np.where(inside, y1 + step * (slope + bend * step), y[np.arange(len(y)), best])
     at, top, within = (np.where(known, v, np.nan) for v in (at, top, inside))
@@ -287,7 +288,8 @@ def quantiles(draws: Array, levels: Levels, weight: Array | None = None) -> Arra
         weight = np.broadcast_to(weight[:, None], draws.shape)
         found = np.quantile(draws, q, axis=0, weights=weight, method="inverted_cdf")
         return np.asarray(np.where(np.isnan(draws).any(axis=0), np.nan, found))
-    found = np.quantile(draws, q, axis=0)
+    with np.errstate(invalid="ignore"):  # of what no float holds
+        found = np.quantile(draws, q, axis=0)
     if np.isnan(found).any():
         # A parameter vector for which the equation has no value there is left out, not spread;
         # where none has a value, neither have the bands.
