@@ -253,7 +253,8 @@ def predict(
     for doubt in doubts:
         announce(doubt)
     columns = prediction_columns(prediction, table)
-    columns, everywhere = asked.columns(columns, {prediction.output: prediction}, given, out)
+    found = {prediction.output: prediction}
+    columns, everywhere, said = asked.columns(columns, found, given, out)
     if not converged:
         columns["converged"] = ["no"] * len(given)
     outside = _say_outside(read, known, columns)
@@ -266,6 +267,8 @@ def predict(
                 "fit again"
             )
         announce(f"no value (nan) at {undefined} of {len(table)} rows{why}")
+    for line in said:
+        announce(line)
     _give(columns, out, *(p.table for p in problems.values()))
     numbers = {"columns": _numbers(columns)} | ({"everywhere": everywhere} if everywhere else {})
     finish(0 if converged else 3, numbers, outside=outside, doubts=list(doubts))
@@ -325,16 +328,18 @@ def _predict_corrected(
             f"what is predicted is the reading, with {', '.join(faults)} in it; once the "
             f"instrument is repaired, predict --without {' --without '.join(faults)}"
         )
-    of_outputs = [v for n, v in columns.items() if n.endswith(("_before", "_after"))]
+    outputs = map(OUTPUTS.__getitem__, corrected.data.names if asked.anything else ())
+    found = {column: prediction.draws(column) for column in outputs}
+    columns, everywhere, said = asked.columns(columns, found, given, out)
+    outside = _say_outside(read, covered(corrected, read), columns)
+    of_outputs = [v for n, v in prediction.columns.items() if n.endswith(("_before", "_after"))]
     if nowhere := int(np.isnan(np.array(of_outputs, dtype=np.float64)).any(axis=0).sum()):
         announce(
             f"no value (nan) at {nowhere} of {len(table)} rows: the simulator has none there, or "
             "explanations differ too much"
         )
-    outputs = map(OUTPUTS.__getitem__, corrected.data.names if asked.anything else ())
-    found = {column: prediction.draws(column) for column in outputs}
-    columns, everywhere = asked.columns(columns, found, given, out)
-    outside = _say_outside(read, covered(corrected, read), columns)
+    for line in said:
+        announce(line)
     _give(columns, out, corrected.data.case.lab, corrected.data.case.field)
     numbers = {"columns": _numbers(columns)} | ({"everywhere": everywhere} if everywhere else {})
     finish(0, numbers, outside=outside)

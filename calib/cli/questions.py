@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from calib.cli.options import announce, column_value
+from calib.cli.options import column_value
 from calib.errors import CalibError
 
 if TYPE_CHECKING:
@@ -96,8 +97,11 @@ class Asked:
 
     def columns(
         self, columns: dict[str, Any], found: Found, given: Table, out: Path | None
-    ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-        """Return columns with what was asked, and what holds in all rows; write the draws."""
+    ) -> tuple[dict[str, Any], list[dict[str, Any]], list[str]]:
+        """Return columns with what was asked, what holds in all rows, and what to say of both.
+
+        Draws are written.
+        """
         import numpy as np
 
         from calib.data import write_table
@@ -108,13 +112,14 @@ class Asked:
             along = _named(self.over, [*given]).quantity.canonical
             each = np.reshape(columns["outside_calibrated_range"], (len(given), _POINTS))
             flags = ["+".join(dict.fromkeys(filter(None, row))) for row in each.tolist()]
-            asked = echoed(given, *OUTPUTS.values(), along) | _peaks(self.over, found)
-            return asked | {"outside_calibrated_range": flags}, []
-        more, everywhere = dict[str, Any](), [dict[str, Any]() for _ in self.limits]
-        for (header, limit, sign), numbers in zip(self.limits, everywhere, strict=True):
+            peaks, said = _peaks(self.over, found)
+            columns = echoed(given, *OUTPUTS.values(), along) | peaks
+            return columns | {"outside_calibrated_range": flags}, [], said
+        more, everywhere = dict[str, Any](), []
+        for header, limit, sign in self.limits:
             cells, whole = _chances(found, header, limit, sign)
             more |= cells
-            numbers |= whole
+            everywhere.append(whole)
         for name, one in found.items() if self.quantiles else ():
             for kind, values in one.quantile(self.quantiles)._asdict().items():
                 levels = zip(self.quantiles, values, strict=True)
@@ -123,7 +128,18 @@ class Asked:
             drawn = {name: one.draws(self.draws) for name, one in found.items()}
             write_table(draws_beside(out), long := _long(drawn))
             print(f"{long['draw'][-1]} draws of each row written to {draws_beside(out)}")
-        return before_last(columns, more), everywhere
+        return before_last(columns, more), everywhere, [_in_words(e) for e in everywhere]
+
+
+def _in_words(whole: Mapping[str, Any]) -> str:
+    """Say what holds in all rows."""
+    kinds = (
+        f"{kind} {whole[kind]:.4g} (Monte Carlo error {whole[f'{kind}_error']:.1g})"
+        if math.isfinite(whole[kind])
+        else f"{kind} unknown"
+        for kind in ("mean", "reading")
+    )
+    return f"probability of {whole['asked']} in all rows: {', '.join(kinds)}"
 
 
 def _named(header: str, names: Sequence[str]) -> Column:
@@ -142,34 +158,27 @@ def _named(header: str, names: Sequence[str]) -> Column:
 def _chances(
     found: Found, header: str, limit: float, sign: str
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the columns of a probability, and what it is in all rows at once; say that."""
-    import numpy as np
-
+    """Return the columns of a probability, and what it is in all rows at once."""
     from calib.data.table import normal
 
     column = _named(header, [*found])
     p = found[column.quantity.canonical].probability(sign, float(column.to_canonical(limit)))
     what = f"{'above' if sign == '>' else 'below'}_{limit:g}"
     columns, whole = dict[str, Any](), dict[str, Any](asked=f"{header} {sign} {limit:g}")
-    said = []
     for kind, row, every in (
         ("mean", p.mean, p.mean_everywhere), ("reading", p.reading, p.reading_everywhere),
     ):  # fmt: skip
         columns[f"{normal(header)}_{kind}_{what}"] = row.value
         columns[f"{normal(header)}_{kind}_{what}_error"] = row.error
         whole |= {kind: float(every.value), f"{kind}_error": float(every.error)}
-        known = f"{every.value:.4g} (Monte Carlo error {every.error:.1g})"
-        said.append(f"{kind} {known if np.isfinite(every.value) else 'unknown'}")
-    if (n := p.mean.value.size) > 1:
-        announce(f"probability of {whole['asked']} in all {n} rows: {', '.join(said)}")
     return columns, whole
 
 
-def _peaks(over: str, found: Found) -> dict[str, Any]:
+def _peaks(over: str, found: Found) -> tuple[dict[str, Any], list[str]]:
     """Return columns that say where each output peaks, and how high, with 90 % bands."""
     from calib.data.table import normal
 
-    columns = dict[str, Any]()
+    columns, said = dict[str, Any](), []
     for name, one in found.items():
         peak = one.peak(over)
         for what, sample in ((f"_at_{normal(over)}", peak.at), ("", peak.output)):
@@ -179,11 +188,11 @@ def _peaks(over: str, found: Found) -> dict[str, Any]:
         columns[f"{name}_peak_inside"] = peak.inside.value
         columns[f"{name}_peak_inside_error"] = peak.inside.error
         if beyond := int((peak.inside.value < 0.95).sum()):
-            announce(
+            said.append(
                 f"at {beyond} of {peak.inside.value.size} settings the peak may lie beyond the "
                 f"range of {over}; {name}_peak_inside is the probability that it does not"
             )
-    return columns
+    return columns, said
 
 
 def _long(drawn: Mapping[str, Drawn]) -> dict[str, Any]:

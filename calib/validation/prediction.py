@@ -57,7 +57,7 @@ class Part:
     """Draws of one problem's parameters, (size, d_all), that a prediction is made from.
 
     Which are alike, how many independent ones say as much, the seed and labels of their random
-    numbers, and what tells the joint posterior that they are part of, if they are.
+    numbers, and what tells the posterior that they are of, a joint one of several outputs perhaps.
     """
 
     problem: Problem
@@ -66,7 +66,7 @@ class Part:
     effective: float
     seed: int
     labels: tuple[str | int, ...]
-    joint: tuple[object, ...] = ()
+    posterior: tuple[object, ...]
 
 
 def _part(calibration: Calibration, size: int, *labels: str | int) -> Part:
@@ -78,11 +78,10 @@ def _part(calibration: Calibration, size: int, *labels: str | int) -> Part:
     block = picked // (walkers * steps) * parts + picked % steps * parts // steps
     # Of chains that are too short to tell, one.
     ess = np.nan_to_num(np.append(report.ess_bulk, report.ess_tail), nan=1.0).min()
-    joint = calibration.part_of, calibration.seed, draws.evaluations, draws.seconds
     return Part(
         problem, problem.theta(draws.flat[picked]), np.unique(block, return_inverse=True)[1],
-        min(float(picked.size), max(float(ess), 1.0)),
-        calibration.seed, (calibration.label, *labels), joint if calibration.part_of else (),
+        min(float(picked.size), max(float(ess), 1.0)), calibration.seed,
+        (calibration.label, *labels), (calibration.seed, draws.evaluations, draws.seconds),
     )  # fmt: skip
 
 
@@ -114,7 +113,6 @@ def _locations(
         yield rows, share, kept
 
 
-@one_thread()
 def _quantiles(parts: Sequence[Part], table: Table, q: Levels) -> tuple[Array, Array, Array]:
     """Quantiles of mean and reading, (q, n), and the part of the draws with a value, (n,)."""
     normals = []
@@ -270,8 +268,8 @@ def combine(
 ) -> Drawn:
     """Form a function of several outputs, draw by draw, such as an efficiency of pull and torque.
 
-    Outputs of one joint posterior share their parameters draw by draw. Posteriors of data sets of
-    their own are independent.
+    Outputs of one joint posterior share their parameters draw by draw. Separate fits are taken for
+    independent, which those of data in common are not.
 
     Parameters
     ----------
@@ -295,29 +293,29 @@ def combine(
     >>> import calib
     >>> from calib.validation.prediction import combine
     >>> ruts = calib.load_he2019("rut_depth")
-    >>> at = {"average_ground_pressure_kpa": [100.0], "slip_ratio": [0.1]}
-    >>> found = {}
-    >>> for name in ("bekker", "modified_bekker"):
-    ...     calibration = calib.calibrate(calib.build_problem(name, ruts), seed=1, label=name)
-    ...     found[name] = calib.predict(calibration, at)
-    >>> slip_part = combine(found, lambda bekker, modified_bekker: modified_bekker - bekker)
-    >>> slip_part.mean.quantile(0.5).shape
-    (1,)
+    >>> calibration = calib.calibrate(calib.build_problem("bekker", ruts), seed=1)
+    >>> found = calib.predict(calibration, {"average_ground_pressure_kpa": [100.0, 150.0]})
+    >>> deeper = combine({"rut": found}, lambda rut: rut[:, 1:] - rut[:, :1])
+    >>> float(deeper.mean.probability(">", 0.0).value[0])
+    1.0
     """
     drawn = {name: p.draws(size) for name, p in predictions.items()}
-    if len({d.mean.values.shape for d in drawn.values()}) != 1:
+    conditions = {n: v for d in drawn.values() for n, v in d.conditions.items()}
+    alike = all(
+        np.array_equal(v, conditions[n]) for d in drawn.values() for n, v in d.conditions.items()
+    )
+    if not alike or len({d.mean.values.shape for d in drawn.values()}) != 1:
         raise CalibError(
             "the predictions differ in their rows or draws", where="combine",
             expected="one or more predictions at the same conditions, of as many draws",
-            hint="predict each at the same table",
+            hint="predict all rows in one table; columns of its draws are its rows",
         )  # fmt: skip
-    known, conditions = dict[object, int](), dict[str, Array]()
+    known = dict[object, int]()
     arguments: tuple[dict[str, Array], dict[str, Array]] = ({}, {})
     for name, d in drawn.items():
-        joint = tuple(part.joint for part in predictions[name]._parts)
+        posterior = tuple(part.posterior for part in predictions[name]._parts)
         # Chains of one seed might move alike: posteriors of their own are paired at a distance.
-        place = known.setdefault(joint if all(joint) else name, len(known))
-        by, conditions = place * len(d.mean.values) // len(drawn), conditions | {**d.conditions}
+        by = known.setdefault(posterior, len(known)) * len(d.mean.values) // len(drawn)
         for values, of in zip(arguments, (d.mean, d.reading), strict=True):
             values[name] = np.roll(of.values, by, axis=0)
     least = min((d.mean.weights for d in drawn.values()), key=lambda w: w.effective)
@@ -381,12 +379,12 @@ def predict_prior(problem: Problem, table: Table) -> Prediction:
     labels, size = (problem.bound.model.name, "prior"), 2 * N_DRAWS
     natural = problem.theta(problem.priors.sample(generator(0, *labels, "parameters"), size))
     good = np.ones(size, dtype=np.bool_)
-    every = Part(problem, natural, np.zeros(size, np.intp), 1.0, 0, labels)
+    every = Part(problem, natural, np.zeros(size, np.intp), 1.0, 0, labels, labels)
     for _, _, ((_, _, location),) in _locations([every], table, least=0.0):
         good &= np.isfinite(location).all(axis=1)
     natural = natural[good if good.sum() >= N_DRAWS else slice(None)][:N_DRAWS]
     block = np.arange(N_DRAWS) * BLOCKS // N_DRAWS
-    part = Part(problem, natural, block, float(N_DRAWS), 0, labels)
+    part = Part(problem, natural, block, float(N_DRAWS), 0, labels, labels)
     return _predicted((part,), table, prior=True)
 
 

@@ -61,7 +61,7 @@ def test_questions_are_answered_in_columns_of_their_own(calib: Calib, run: Path,
                 column(ran.out, f"rut_depth_mm_{banded}_90_{end}"),
             )
     assert ran.out.splitlines()[0].endswith(",outside_calibrated_range")
-    assert "probability of rut_depth_cm > 2 in all 3 rows: mean " in ran.err
+    assert "probability of rut_depth_cm > 2 in all rows: mean " in ran.err
     told = json.loads(calib(*asked, "--json").out)["everywhere"]
     assert [one["asked"] for one in told] == ["rut_depth_cm > 2", "rut_depth_mm < 20"]
     table = package.read_table(at)

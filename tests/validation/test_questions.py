@@ -241,18 +241,20 @@ def test_peaks_are_those_of_a_fine_grid(pull_calibration: Calibration) -> None:
 
 
 def test_functions_of_outputs_are_formed_draw_by_draw(line) -> None:
-    """Of one joint posterior the mean has no doubt left; of two posteriors it has both."""
-    joint = predict(replace(line, part_of="pull, torque"), at(AT))
+    """Of one posterior the difference has no doubt left; of two posteriors it has both."""
     mine = predict(line, at(AT))
-    same = combine({"a": joint, "b": joint}, lambda a, b: a - b, size=4000)
+    same = combine({"a": mine, "b": mine}, lambda a, b: a - b, size=4000)
     assert not same.mean.values.any()
-    apart = combine({"a": mine, "b": mine}, lambda a, b: a - b, size=4000)
+    other = predict(calibrate(line.problem, 1), at(AT))  # of the same seed
+    apart = combine({"a": mine, "b": other}, lambda a, b: a - b, size=4000)
     sd = mine.draws(4000).mean.values.std(axis=0)
     np.testing.assert_allclose(apart.mean.values.std(axis=0), np.sqrt(2.0) * sd, rtol=0.08)
     with pytest.raises(CalibError, match=r"returned the shape \(3,\)"):
         combine({"a": mine}, lambda a: a[0])
     with pytest.raises(CalibError, match="differ in their rows"):
         combine({"a": mine, "b": predict(line, at(AT[:2]))}, lambda a, b: a - b[:, :1])
+    with pytest.raises(CalibError, match="differ in their rows"):
+        combine({"a": mine, "b": predict(line, at(AT[::-1]))}, lambda a, b: a - b)
 
 
 def test_what_priors_expect_is_said_without_data() -> None:
