@@ -233,9 +233,10 @@ def predict(
         announce("this calibration did not converge; its bands are not to be used")
     problems = {c.problem.bound.model.name: c.problem for _, c in stack}
     models = [p.bound.model for p in problems.values()] or [get_model(str(model))]
-    read = read_for_model(at, tuple(dict.fromkeys(n for m in models for n in m.conditions)))
+    conditions = tuple(dict.fromkeys(n for m in models for n in m.conditions))
+    read = read_for_model(at, conditions)
     known = {n: v for p in problems.values() for n, v in p.conditions.items()}
-    given, table = asked.rows(read)
+    given, table = asked.rows(read, conditions)
     check_conditions(read, known)
     kept, doubts = {} if run is None else verdicts_of(run), dict[str, None]()
     for name in problems:
@@ -315,7 +316,12 @@ def _predict_corrected(
     used = sorted({c for o in corrected.data.outputs for c in o.problem.bound.model.conditions})
     read = read_for_model(at, used)
     check_units_of(corrected, read)
-    given, table = asked.rows(read)
+    if asked.over and corrected.data.case.covariates:
+        raise CalibError(
+            "a peak is not sought where a diagnosis has covariates of its own", where="--peak-over",
+            hint="give the rows of each curve, and ask calib.predict(…).draws(output).peak(…)",
+        )  # fmt: skip
+    given, table = asked.rows(read, [n for n in read if n not in OUTPUTS.values()])
     prediction = predict_corrected(corrected, table, without)
     columns = dict(prediction.columns)
     if "run_order" in corrected.data.view.conditions and "run_order" not in table:

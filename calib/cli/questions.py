@@ -81,15 +81,15 @@ class Asked:
         """Whether there are questions at all."""
         return bool(self.limits or self.quantiles or self.draws or self.over)
 
-    def rows(self, table: Table) -> tuple[Table, Table]:
+    def rows(self, table: Table, conditions: Sequence[str]) -> tuple[Table, Table]:
         """Return the rows to answer for, and those to predict at: curves, if a peak is sought."""
         import numpy as np
 
         if not self.over:
             return table, table
-        along = _named(self.over, [*table]).quantity.canonical
+        along = _named(self.over, conditions).quantity.canonical
         x = table[along]
-        others = np.stack([np.zeros(x.size), *(table[n] for n in table if n != along)])
+        others = np.stack([np.zeros(x.size), *(table[n] for n in conditions if n != along)])
         given = table.take(np.sort(np.unique(others, axis=1, return_index=True)[1]))
         points = np.tile(np.linspace(x.min(), x.max(), _POINTS), len(given))
         curves = given.take(np.repeat(np.arange(len(given)), _POINTS))

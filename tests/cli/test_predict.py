@@ -102,6 +102,13 @@ def test_a_peak_is_sought_along_a_condition(calib: Calib, run: Path, at: str) ->
         column(top, "rut_depth_mm_parameter_50_lower")[1:] / 2.0
         + column(top, "rut_depth_mm_parameter_50_upper")[1:] / 2.0, rtol=0.01,
     )  # fmt: skip
+    # What the model does not take tells no settings apart.
+    with_more = AT.replace("percent\n", "percent,rut_depth_mm,note\n").replace(
+        "0,10\n", "0,10,4,wet\n"
+    ).replace("0,5\n", "0,5,3,dry\n") + "10,9,5,dry\n"  # fmt: skip
+    Path("more.csv").write_text(with_more, encoding="utf-8")
+    more = calib("predict", run, "--at", "more.csv", "--peak-over", "slip_percent").out
+    assert column(more, "Average ground pressure [psi]").tolist() == [10.0, 20.0, 30.0]
     assert_refused(calib("predict", run, "--at", at, "--peak-over", "slip"), ["slip"])
 
 
