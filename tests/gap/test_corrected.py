@@ -312,6 +312,18 @@ def test_a_diagnosis_answers_with_the_doubt_about_its_cause(saved, tmp_path):
     column = told["columns"]["drawbar_pull_n_mean_above_900"]
     np.testing.assert_allclose(column, over.mean.value, atol=1e-9)
     assert told["everywhere"][0]["mean"] == pytest.approx(float(over.mean_everywhere.value))
+    setting = {name: values[:1] for name, values in table.columns.items()}
+    ends = {name: np.repeat(values, 2) for name, values in setting.items()}
+    write_table(tmp_path / "curve.csv", ends | {"slip_ratio": np.array([0.02, 0.6])})
+    asked = ["--peak-over", "slip_ratio", "--json"]
+    given = ["predict", str(folder), "--at", str(tmp_path / "curve.csv"), *asked]
+    (peak,) = json.loads(CliRunner().invoke(app, given).stdout)["columns"][
+        "drawbar_pull_kn_peak_median"
+    ]
+    slip = np.linspace(0.02, 0.6, 30)
+    curve = {name: np.repeat(values, 30) for name, values in setting.items()}
+    along = predict(found, curve | {"slip_ratio": slip}).draws("drawbar_pull_kn")
+    assert peak == pytest.approx(float(along.quantile(0.5).mean.max()), rel=0.02)
 
 
 def test_an_effect_of_ones_own_is_passed_to_predict(tmp_path, capsys):
