@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from json import dumps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
 from calib.cli import options as opt
 from calib.cli.options import announce, finish
 from calib.errors import CalibError, meant
+from calib.report.numbers import finite
 
 if TYPE_CHECKING:
     from calib.inference.calibration import Calibration
@@ -23,24 +26,36 @@ class Wanted(NamedTuple):
     at: Mapping[str, float]
     draws: int
     each: bool
+    form: str
 
 
 def export(
     run: Annotated[Path, typer.Argument(help="Run folder of `calib fit`.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write.")],
     form: Annotated[
-        str, typer.Option("--format", help="tir: sections of a tyre property file.")
-    ] = "tir",
+        str,
+        typer.Option(
+            "--format",
+            help="csv, json, parquet: draws of the parameters. tir: sections of a tyre property "
+            "file. By default the ending of --out.",
+        ),
+    ] = "",
     at: Annotated[
         list[str] | None,
         typer.Option(
-            help="Condition that the file is for, e.g. inflation_pressure_psi=30; repeatable."
+            help="Condition that a tyre property file is for, e.g. inflation_pressure_psi=30; "
+            "repeatable."
         ),
     ] = None,
     draws: Annotated[
-        int, typer.Option(help="Draws of the posterior to write beside it, a row each.", min=0)
+        int,
+        typer.Option(
+            help="Draws of the posterior, a row each, evenly spaced; beside a tyre property file.",
+            min=0,
+        ),
     ] = 0,
     each: Annotated[bool, typer.Option("--each", help="Also write a file of each draw.")] = False,
+    overwrite: opt.Overwrite = False,
     plugins: opt.Models = None,
     simulator: opt.Simulators = None,
     json: opt.Json = False,
@@ -49,21 +64,27 @@ def export(
     from calib import load_calibration
     from calib.batch.folders import write_whole, writing
 
+    form = form or out.suffix.removeprefix(".")
     if form not in FORMATS:
         hint = meant(form, FORMATS, "use one of these")
         raise CalibError(f"there is no format {form!r}", expected=", ".join(FORMATS), hint=hint)
     if each and not draws:
         raise CalibError("--each is for draws, and none are asked for", hint="add --draws N")
-    conditions = dict(map(_condition, at or ()))
+    conditions = dict(opt.column_value("--at", text) for text in at or ())
     calibration = load_calibration(run)
     if not calibration.converged:
         announce("this calibration did not converge; it is not to be used")
-    wanted = Wanted(out, conditions, draws, each)
+    wanted = Wanted(out, conditions, draws, each, form)
     files, said = FORMATS[form](calibration, wanted)
-    if there := [path for path in files if path.exists()]:
-        raise CalibError(
-            "the file exists already", where=str(there[0]), hint="choose another --out"
-        )
+    for path in filter(Path.exists, files):
+        if not overwrite:
+            hint = "choose another --out, or pass --overwrite"
+            raise CalibError("the file exists already", where=str(path), hint=hint)
+        begun = files[path][:6]
+        begun = begun if isinstance(begun, bytes) else begun.encode()
+        if not (path.is_file() and path.read_bytes().startswith(begun)):
+            found, hint = "what is there is no earlier export", "choose another --out"
+            raise CalibError(found, where=str(path), hint=hint)
     print(said)
     with writing(out):
         for path, text in files.items():
@@ -74,26 +95,76 @@ def export(
     finish(0 if calibration.converged else 3, {"files": [str(path) for path in files]})
 
 
-def _condition(text: str) -> tuple[str, float]:
-    column, _, value = text.partition("=")
-    try:
-        return column.strip(), float(value)
-    except ValueError:
+def _parameters(calibration: Calibration, wanted: Wanted) -> Written:
+    """Return draws of all parameters that vary, sampled and published, evenly spaced."""
+    from calib.data.files import table_csv
+
+    if wanted.at or wanted.each:
         raise CalibError(
-            f"cannot read --at {text!r}",
-            expected="COLUMN=VALUE, for instance inflation_pressure_psi=30",
-            hint="name a column with its unit, an equals sign and one number",
-        ) from None
+            "draws of parameters are for no condition, and one file", where=str(wanted.out),
+            hint="leave --at and --each out, or write a tyre property file: --format tir",
+        )  # fmt: skip
+    problem, picked = calibration.problem, calibration.picked(wanted.draws or 1000)
+    model, n = problem.bound.model, len(picked)
+    draws = {name: v.ravel()[picked].tolist() for name, v in calibration.parameters.items()}
+    units = {name: calibration.summary[name].unit for name in draws}
+    columns = {"draw": list(range(1, n + 1))}
+    columns |= {f"{name} [{units[name]}]": values for name, values in draws.items()}
+    entries: dict[str, dict[str, Any]] = {
+        name: {
+            "unit": unit, "meaning": model.meanings.get(name, ""), "sampled": name in problem.names,
+        }
+        for name, unit in units.items()
+    }  # fmt: skip
+    document = {
+        "schema": "calib/draws/1", "model": model.name, "equation": model.equation,
+        "output": model.output, "response": model.response, "conditions": list(model.conditions),
+        "references": dict(problem.bound.references), "noise": asdict(problem.noise),
+        "fixed": {p.name: p.loc for p in problem.priors.entries if p.fixed},
+        "converged": calibration.converged, "data_label": problem.table.label, "draws": n,
+        "of_draws": len(calibration.draws.flat), "parameters": entries,
+    }  # fmt: skip
+    content: str | bytes
+    if wanted.form == "csv":
+        content = table_csv(columns)
+    elif wanted.form == "json":
+        for name, values in draws.items():
+            entries[name]["values"] = values
+        content = _json_text(document)
+    else:
+        content = _parquet(columns, _json_text(document), wanted.out)
+    return {wanted.out: content}, f"{n} of {document['of_draws']} draws, evenly spaced"
 
 
-def _tir(calibration: Calibration, wanted: Wanted) -> tuple[dict[Path, str], str]:
+def _json_text(document: Mapping[str, Any]) -> str:
+    return dumps(finite(document), ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def _parquet(columns: Mapping[str, list[Any]], described: str, out: Path) -> bytes:
+    """Return a Parquet file, described in its metadata."""
+    try:
+        import pyarrow
+        from pyarrow import parquet
+    except ImportError as error:
+        raise CalibError(
+            f"a package that writes such files is not installed ({error})", where=str(out),
+            hint="install it: pip install 'terracalib[import]'; or write CSV",
+        ) from None  # fmt: skip
+    file = pyarrow.BufferOutputStream()
+    table = pyarrow.table(dict(columns)).replace_schema_metadata({"calib": described})
+    parquet.write_table(table, file)
+    return bytes(file.getvalue().to_pybytes())
+
+
+def _tir(calibration: Calibration, wanted: Wanted) -> Written:
     """Return the files with their texts, and what to say of them."""
     from calib.data.files import table_csv
     from calib.inference.tyre import tir_draws, to_tir
     from calib.models.tir import FORCE
 
     out, tyre = wanted.out, to_tir(calibration, at=wanted.at)
-    files, said = {out: tyre.text}, "\n".join(tyre.comments)
+    files: dict[Path, str | bytes] = {out: tyre.text}
+    said = "\n".join(tyre.comments)
     if not wanted.draws:
         return files, said
     drawn = tir_draws(calibration, wanted.draws, at=wanted.at)
@@ -106,4 +177,8 @@ def _tir(calibration: Calibration, wanted: Wanted) -> tuple[dict[Path, str], str
     return files, said
 
 
-FORMATS: Mapping[str, Callable[[Calibration, Wanted], tuple[dict[Path, str], str]]] = {"tir": _tir}
+# Files by their paths, and what to say of them.
+type Written = tuple[dict[Path, str | bytes], str]
+FORMATS: Mapping[str, Callable[[Calibration, Wanted], Written]] = {
+    "csv": _parameters, "json": _parameters, "parquet": _parameters, "tir": _tir,
+}  # fmt: skip

@@ -11,14 +11,16 @@ import typer
 
 from calib.cli import options as opt
 from calib.cli.calibration import tell_verdict
-from calib.cli.options import announce, emulate, finish, progress_bars
+from calib.cli.options import emulate, finish, progress_bars
 from calib.errors import CalibError
 
 if TYPE_CHECKING:
     from calib.data import Table
     from calib.inference.emulation import Emulation
     from calib.inference.joint import JointCalibration, JointProblem
+    from calib.inference.problem import Problem
     from calib.report.verdict import Verdict
+    from calib.validation.prediction import Prediction
     from calib.validation.validate import Validation
 
 
@@ -275,7 +277,7 @@ def _score(validation: Validation, what: str) -> Mapping[str, Any]:
     }  # fmt: skip
 
 
-def _doubts(run: Path, label: str | None) -> list[str]:
+def doubts_of(run: Path, label: str | None) -> list[str]:
     """Return the warnings of the verdicts that a folder keeps: of a group, or of all."""
     from calib.data.files import read_json
     from calib.inference.joint_files import JOINT
@@ -287,24 +289,17 @@ def _doubts(run: Path, label: str | None) -> list[str]:
     return list(dict.fromkeys(said))
 
 
-def predicted(
-    run: Path, at: Path, label: str | None
-) -> tuple[JointCalibration, Table, dict[str, Any], Sequence[Sequence[str]]]:
-    """Predict the outputs whose conditions are there, for a group or a new one.
+def readable(found: JointCalibration, at: Path) -> tuple[Table, dict[str, Problem]]:
+    """Read conditions, and return the outputs that can be predicted there, as fitted.
 
-    Returns the calibration, the table of conditions, columns of a CSV, and what is outside.
+    A CalibError if there are none.
     """
     import numpy as np
 
     from calib.data import read_table
     from calib.data.checks import check_conditions
     from calib.data.quantities import QUANTITIES
-    from calib.inference.joint_files import load_joint
-    from calib.validation.prediction import band_columns, echoed, predict
 
-    found = load_joint(run)
-    for doubt in _doubts(run, label):
-        announce(doubt)
     table = read_table(at, allow_missing=[*QUANTITIES])
     wholes = {
         output: w for output, w in found.problem.wholes.items()
@@ -319,23 +314,27 @@ def predicted(
             ),
             hint="add columns, or fill empty cells",
         )  # fmt: skip
-    known = {n: v for w in wholes.values() for n, v in w.conditions.items()}
-    check_conditions(table, known)
+    check_conditions(table, {n: v for w in wholes.values() for n, v in w.conditions.items()})
+    return table, wholes
+
+
+def predicted(
+    found: JointCalibration, wholes: Mapping[str, Problem], table: Table, label: str | None
+) -> tuple[dict[str, Prediction], dict[str, Any]]:
+    """Predict outputs for a group or a new one, and lay them out as columns of a CSV."""
+    from calib.validation.prediction import band_columns, echoed, predict
+
     columns: dict[str, Any] = dict(echoed(table, *(w.bound.model.output for w in wholes.values())))
-    flags: list[dict[str, None]] = [{} for _ in range(len(table))]
+    predictions: dict[str, Prediction] = {}
     notes: list[dict[str, None]] = [{} for _ in range(len(table))]
-    done = set[str]()
     for output in wholes:
         prediction = predict(found.calibration(output, label), table)
         banded = band_columns(prediction)
         # The sinkage of a wheel and of a plate have one name.
-        prefix = f"{output}." if prediction.output in done else ""
-        done.add(prediction.output)
-        columns |= {prefix + n: v for n, v in banded.items() if n != "outside_calibrated_range"}
-        for row, note, names, text in zip(
-            flags, notes, prediction.outside, banded["outside_calibrated_range"], strict=True
-        ):
-            row.update(dict.fromkeys(names))
-            note.update(dict.fromkeys([text] if text else []))
-    columns["outside_calibrated_range"] = ["; ".join(map(str, note)) for note in notes]
-    return found, table, columns, [tuple(row) for row in flags]
+        prefix = f"{output}." if prediction.output in predictions else ""
+        predictions[prefix + prediction.output] = prediction
+        for note, text in zip(notes, banded.pop("outside_calibrated_range"), strict=True):
+            note.update(dict.fromkeys([str(text)] if text else []))
+        columns |= {prefix + n: v for n, v in banded.items()}
+    columns["outside_calibrated_range"] = ["; ".join(note) for note in notes]
+    return predictions, columns

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TextIO
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from calib.errors import CalibError
 from calib.report.numbers import finite
 
 if TYPE_CHECKING:
@@ -363,3 +364,16 @@ def say_failed(model: str) -> None:
         f"{'' if first is None else first.reason}{listed}; the posterior keeps out of where there "
         "is no value"
     )
+
+
+def column_value(option: str, text: str) -> tuple[str, float]:
+    """Read COLUMN=VALUE."""
+    column, _, value = text.partition("=")
+    try:
+        return column.strip(), float(value)
+    except ValueError:
+        raise CalibError(
+            f"cannot read {option} {text!r}",
+            expected="COLUMN=VALUE, for instance inflation_pressure_psi=30",
+            hint="name a column with its unit, an equals sign and one number",
+        ) from None

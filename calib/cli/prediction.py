@@ -12,12 +12,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from calib.cli import options as opt
+from calib.cli import questions
 from calib.cli.options import announce, finish, progress_bars, say
 from calib.errors import CalibError
 
 if TYPE_CHECKING:
     from calib.data import Table
     from calib.gap.case import Case
+    from calib.inference.calibration import Calibration
     from calib.inference.emulation import Emulation
 
 
@@ -144,13 +146,29 @@ def prepare_case(case: Case, run: Path | None, seed: int, workers: int) -> list[
 
 
 def predict(
-    run: Annotated[
-        Path, typer.Argument(help="Folder of `calib fit`, `calib compare` or `calib diagnose`.")
-    ],
     at: Annotated[Path, typer.Option(help="CSV with the conditions.")],
+    run: Annotated[
+        Path | None,
+        typer.Argument(
+            help="Folder of `calib fit`, `calib compare` or `calib diagnose`; without one, --model."
+        ),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="CSV to write; by default printed.")
     ] = None,
+    model: Annotated[
+        str | None,
+        typer.Option(
+            help="Model to predict with before there are data, from its priors.",
+            autocompletion=opt.completing("models"),
+        ),
+    ] = None,
+    priors: Annotated[Path | None, typer.Option(help="Prior file of --model.")] = None,
+    exceeds: questions.Exceeds = None,
+    below: questions.Below = None,
+    quantiles: questions.Quantiles = None,
+    draws: questions.DrawsBeside = 0,
+    peak_over: questions.PeakOver = None,
     effects: opt.EffectsFile = None,
     without: Annotated[
         list[str] | None,
@@ -169,96 +187,133 @@ def predict(
     simulator: opt.Simulators = None,
     json: opt.Json = False,
 ) -> None:
-    """Predict at new conditions, with 50, 90 and 95 % bands (a diagnosis: 90 %)."""
+    """Predict at new conditions, with 50, 90 and 95 % bands (a diagnosis: 90 %), and answer."""
     from calib.batch.folders import check_room
 
+    asked = questions.Asked.read(exceeds, below, quantiles, draws, peak_over, out)
     if out is not None:
-        if out.exists():
-            _check_replaceable(out, at, overwrite)
+        written: dict[Path, tuple[str, ...]] = {out: ("outside_calibrated_range", "converged")}
+        written |= {questions.draws_beside(out): ("_reading",)} if draws else {}
+        for path, last in written.items():
+            if path.exists():
+                _check_replaceable(path, at, overwrite, last)
         check_room(out)
-    if (run / "joint.json").exists():
-        _predict_joint(run, at, out, group)
+    if (run is None) == (model is None) or (model is None and priors is not None):
+        raise CalibError(
+            "it is not clear what to predict with",
+            expected="a folder of a run, or --model with or without --priors",
+            hint="give one of the two; a run has its priors",
+        )
+    if run is not None and (run / "joint.json").exists():
+        _predict_joint(run, at, out, group, asked)
         return
-    if (run / "corrected.json").exists():
-        _predict_corrected(run, at, out, effects, without or [])
+    if run is not None and (run / "corrected.json").exists():
+        _predict_corrected(run, at, out, effects, without or [], asked)
         return
     if effects is not None or without:
         raise CalibError(
             "there is no diagnosis, which alone has effects",
-            where=str(run),
+            where=str(run or model),
             expected="a folder of `calib diagnose`",
             hint="correct its name, or leave --effects and --without out",
         )
     from calib import load_calibration
     from calib.data import read_for_model
     from calib.data.checks import check_conditions
+    from calib.inference.problem import problem_without_data
+    from calib.models import get_model
     from calib.models.simulators.emulator import emulator_of
     from calib.report.comparison import load_stack, verdicts_of
     from calib.validation.constants import MIN_DEFINED
     from calib.validation.prediction import predict as predict_at
-    from calib.validation.prediction import predict_stacked, prediction_columns
+    from calib.validation.prediction import predict_prior, predict_stacked, prediction_columns
 
-    if (run / "comparison.json").exists():
-        found, stack = load_stack(run)
-        converged = bool(found["converged"])
-    else:
+    stack: list[tuple[float, Calibration]] = []
+    converged = True
+    if run is not None and (run / "comparison.json").exists():
+        record, stack = load_stack(run)
+        converged = bool(record["converged"])
+    elif run is not None:
         stack = [(1.0, load_calibration(run))]
         converged = stack[0][1].converged
     if not converged:
         announce("this calibration did not converge; its bands are not to be used")
     problems = {c.problem.bound.model.name: c.problem for _, c in stack}
-    table = read_for_model(
-        at, tuple(dict.fromkeys(n for p in problems.values() for n in p.bound.model.conditions))
-    )
+    models = [p.bound.model for p in problems.values()] or [get_model(str(model))]
+    conditions = tuple(dict.fromkeys(n for m in models for n in m.conditions))
+    read = read_for_model(at, conditions)
     known = {n: v for p in problems.values() for n, v in p.conditions.items()}
-    check_conditions(table, known)
-    kept, doubts = verdicts_of(run), dict[str, None]()
+    given, table = asked.rows(read, conditions)
+    check_conditions(read, known)
+    kept, doubts = {} if run is None else verdicts_of(run), dict[str, None]()
     for name in problems:
         judged = kept.get(name) or kept.get("")
         for doubt in () if judged is None else judged.for_rows(table.columns):
             doubts[f"{name}: {doubt}" if len(stack) > 1 else doubt] = None
+    if run is None:
+        problem = problem_without_data(models[0].name, table, priors)
+        doubts = dict.fromkeys(("no data are known: this is what priors expect", *problem.notes))
+        prediction = predict_prior(problem, table)
+    elif len(stack) == 1:
+        prediction = predict_at(stack[0][1], table)
+    else:
+        prediction = predict_stacked(stack, table)
     for doubt in doubts:
         announce(doubt)
-    prediction = (
-        predict_at(stack[0][1], table) if len(stack) == 1 else predict_stacked(stack, table)
-    )
     columns = prediction_columns(prediction, table)
+    found = {prediction.output: prediction}
+    columns, everywhere, said = asked.columns(columns, found, given, out)
     if not converged:
-        columns["converged"] = ["no"] * len(table)
-    outside = _say_outside(table, known, prediction.outside)
+        columns["converged"] = ["no"] * len(given)
+    outside = _say_outside(read, known, columns)
     undefined = int((prediction.defined < MIN_DEFINED).sum())
     if undefined:
-        why = ": the model has none there for much of the posterior"
-        if any(emulator_of(p.bound.model) is not None for p in problems.values()):
+        why = f": the model has none there for much of the {'posterior' if stack else 'prior'}"
+        if any(emulator_of(m) is not None for m in models):
             why = (
                 "; an emulator ends where its runs do: give [ranges] in the simulator file, and "
                 "fit again"
             )
         announce(f"no value (nan) at {undefined} of {len(table)} rows{why}")
+    for line in said:
+        announce(line)
     _give(columns, out, *(p.table for p in problems.values()))
-    numbers = {"columns": _numbers(columns)}
+    numbers = {"columns": _numbers(columns)} | ({"everywhere": everywhere} if everywhere else {})
     finish(0 if converged else 3, numbers, outside=outside, doubts=list(doubts))
 
 
-def _predict_joint(run: Path, at: Path, out: Path | None, group: str | None) -> None:
-    """Predict every output of a joint calibration, for a group or a new one."""
-    from calib.cli.joint import predicted
+def _predict_joint(
+    run: Path, at: Path, out: Path | None, group: str | None, asked: questions.Asked
+) -> None:
+    """Predict the outputs of a joint calibration whose conditions are there, for a group."""
+    from calib.cli.joint import doubts_of, predicted, readable
+    from calib.inference.joint_files import load_joint
 
-    found, table, columns, flags = predicted(run, at, group)
+    found = load_joint(run)
     if not found.converged:
         announce("this calibration did not converge; its bands are not to be used")
-        columns["converged"] = ["no"] * len(table)
-    wholes = found.problem.wholes.values()
-    known = {n: v for w in wholes for n, v in w.conditions.items()}
-    outside = _say_outside(table, known, flags)
-    _give(columns, out, *(w.table for w in wholes))
-    finish(0 if found.converged else 3, {"columns": _numbers(columns)}, outside=outside)
+    for doubt in doubts_of(run, group):
+        announce(doubt)
+    read, wholes = readable(found, at)
+    known = {n: v for w in wholes.values() for n, v in w.conditions.items()}
+    given, table = asked.rows(read, [*known])
+    predictions, columns = predicted(found, wholes, table, group)
+    columns, everywhere, said = asked.columns(columns, predictions, given, out)
+    if not found.converged:
+        columns["converged"] = ["no"] * len(given)
+    outside = _say_outside(read, known, columns)
+    for line in said:
+        announce(line)
+    _give(columns, out, *(w.table for w in wholes.values()))
+    numbers = {"columns": _numbers(columns)} | ({"everywhere": everywhere} if everywhere else {})
+    finish(0 if found.converged else 3, numbers, outside=outside)
 
 
-def _check_replaceable(out: Path, at: Path, overwrite: bool) -> None:
-    """Refuse to replace a file unless it is a prediction, and that is wanted."""
-    # The last column tells that a file is a prediction, here of a run that did not converge.
-    last = ("outside_calibrated_range", "converged")
+def _check_replaceable(out: Path, at: Path, overwrite: bool, last: tuple[str, ...]) -> None:
+    """Refuse to replace a file unless it is a prediction, and that is wanted.
+
+    The last column tells, of a run that did not converge another one, of draws that of readings.
+    """
     if not overwrite:
         wrong, hint = "the file exists already", "choose another --out, or pass --overwrite"
         raise CalibError(wrong, where=str(out), hint=hint)
@@ -276,13 +331,15 @@ def _check_replaceable(out: Path, at: Path, overwrite: bool) -> None:
 
 
 def _predict_corrected(
-    run: Path, at: Path, out: Path | None, effects: Path | None, without: Sequence[str]
-) -> None:
+    run: Path, at: Path, out: Path | None, effects: Path | None, without: Sequence[str],
+    asked: questions.Asked,
+) -> None:  # fmt: skip
     """Predict with the corrected model of a diagnosis, beside the calibrated simulator."""
     import numpy as np
 
     from calib.data import read_for_model
-    from calib.gap.corrected import check_units_of, covered, load_corrected, predict_columns
+    from calib.data.quantities import OUTPUTS
+    from calib.gap.corrected import check_units_of, covered, load_corrected, predict_corrected
     from calib.gap.effects import EFFECTS
     from calib.gap.effects.user import load_effects
     from calib.models.simulators.files import load_files
@@ -290,10 +347,17 @@ def _predict_corrected(
     load_files(sorted((run / "emulators").glob("*.npz")))
     own = {} if effects is None else load_effects(effects)
     corrected = load_corrected(run, {**EFFECTS, **own})
-    used = {c for o in corrected.data.outputs for c in o.problem.bound.model.conditions}
-    table = read_for_model(at, sorted(used))
-    check_units_of(corrected, table)
-    columns = predict_columns(corrected, table, without)
+    used = sorted({c for o in corrected.data.outputs for c in o.problem.bound.model.conditions})
+    read = read_for_model(at, used)
+    check_units_of(corrected, read)
+    if asked.over and corrected.data.case.covariates:
+        raise CalibError(
+            "a peak is not sought where a diagnosis has covariates of its own", where="--peak-over",
+            hint="give the rows of each curve, and ask calib.predict(…).draws(output).peak(…)",
+        )  # fmt: skip
+    given, table = asked.rows(read, [n for n in read if n not in OUTPUTS.values()])
+    prediction = predict_corrected(corrected, table, without)
+    columns = dict(prediction.columns)
     if "run_order" in corrected.data.view.conditions and "run_order" not in table:
         announce(
             "no run_order is given: what depends on it is predicted as it stood at the end of the "
@@ -304,23 +368,29 @@ def _predict_corrected(
             f"what is predicted is the reading, with {', '.join(faults)} in it; once the "
             f"instrument is repaired, predict --without {' --without '.join(faults)}"
         )
-    flags = columns["outside_calibrated_range"]
-    outside = _say_outside(table, covered(corrected, table), [str(row) for row in flags])
-    of_outputs = [v for n, v in columns.items() if n.endswith(("_before", "_after"))]
+    outputs = map(OUTPUTS.__getitem__, corrected.data.names if asked.anything else ())
+    found = {column: prediction.draws(column) for column in outputs}
+    columns, everywhere, said = asked.columns(columns, found, given, out)
+    outside = _say_outside(read, covered(corrected, read), columns)
+    of_outputs = [v for n, v in prediction.columns.items() if n.endswith(("_before", "_after"))]
     if nowhere := int(np.isnan(np.array(of_outputs, dtype=np.float64)).any(axis=0).sum()):
         announce(
             f"no value (nan) at {nowhere} of {len(table)} rows: the simulator has none there, or "
             "explanations differ too much"
         )
+    for line in said:
+        announce(line)
     _give(columns, out, corrected.data.case.lab, corrected.data.case.field)
-    finish(0, {"columns": _numbers(columns)}, outside=outside)
+    numbers = {"columns": _numbers(columns)} | ({"everywhere": everywhere} if everywhere else {})
+    finish(0, numbers, outside=outside)
 
 
-def _say_outside(table: Table, known: Mapping[str, Any], flags: Sequence[Sequence[str]]) -> int:
+def _say_outside(table: Table, known: Mapping[str, Any], columns: Mapping[str, Any]) -> int:
     """Warn of rows outside the calibrated range; return how many there are."""
     from calib.data.checks import beyond_notes
 
-    outside = sum(map(bool, flags))
+    flags = columns["outside_calibrated_range"]
+    outside = sum(bool(flag.partition(" (no value")[0]) for flag in flags)
     if outside:
         lie = "row lies" if outside == 1 else "rows lie"
         announce(
@@ -338,9 +408,8 @@ def _give(columns: dict[str, Any], out: Path | None, *tables: Table) -> None:
     from calib.data.reader import common_label
 
     if label := common_label(*tables):
-        # The last column stays last: it tells that the file is a prediction.
-        name, last = columns.popitem()
-        columns |= {"data_label": [label] * len(last), name: last}
+        n = len(next(iter(columns.values())))
+        columns = questions.before_last(columns, {"data_label": [label] * n})
     if out is not None:
         write_table(out, {name: [_cell(c, "") for c in column] for name, column in columns.items()})
         print(f"{len(next(iter(columns.values())))} rows written to {out}")

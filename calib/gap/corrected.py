@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,7 @@ from calib.inference.priors import Priors
 from calib.models.base import Array
 from calib.shown import Shown
 from calib.validation.prediction import echoed, outside
+from calib.validation.questions import Drawn, Sample, Weights
 
 SCHEMA = "calib/corrected/6"
 
@@ -318,6 +319,25 @@ def predict_columns(
     CalibError
         If a condition is missing, or a cause is none of the corrected model.
     """
+    table, conditions, truth = _truth(corrected, table, left_out)
+    columns = echoed(table, *OUTPUTS.values())
+    for name, p in predict_new(truth, corrected.calibrated(conditions)).items():
+        column = OUTPUTS[name]
+        columns |= {
+            f"{column}_before": p.before,
+            f"{column}_after": p.after,
+            f"{column}_after_lower": p.lower,
+            f"{column}_after_upper": p.upper,
+        }
+    known = covered(corrected, table)
+    flags = outside(known, {name: table[name] for name in known}) or [()] * len(table)
+    return columns | {"outside_calibrated_range": ["+".join(row) for row in flags]}
+
+
+def _truth(
+    corrected: Corrected, table: Table, left_out: Collection[str]
+) -> tuple[Table, dict[str, Array], Truth]:
+    """Draw what happens at conditions; return a table with declared covariates, and them, too."""
     unknown = [cause for cause in left_out if cause not in corrected.causes]
     if unknown:
         raise CalibError(
@@ -340,19 +360,8 @@ def predict_columns(
     if order is not None and order not in conditions:
         # A drift is predicted as it stood at the end of the campaign.
         conditions[order] = np.full(len(table), corrected.data.view.order_range[1])
-    truth = corrected.mixture.at(corrected.data.at_conditions(conditions), left_out=left_out)
-    columns = echoed(table, *OUTPUTS.values())
-    for name, p in predict_new(truth, corrected.calibrated(conditions)).items():
-        column = OUTPUTS[name]
-        columns |= {
-            f"{column}_before": p.before,
-            f"{column}_after": p.after,
-            f"{column}_after_lower": p.lower,
-            f"{column}_after_upper": p.upper,
-        }
-    known = covered(corrected, table)
-    flags = outside(known, {name: table[name] for name in known}) or [()] * len(table)
-    return columns | {"outside_calibrated_range": ["+".join(row) for row in flags]}
+    at = corrected.data.at_conditions(conditions)
+    return table, conditions, corrected.mixture.at(at, left_out=left_out)
 
 
 @dataclass(frozen=True, repr=False)
@@ -372,6 +381,33 @@ class CorrectedPrediction(Shown):
     conditions: Mapping[str, Array]
     columns: Mapping[str, Array | list[str]]
     index: tuple[object, ...] | None = None
+    _made: tuple[Corrected, Table, Collection[str]] = field(kw_only=True)
+
+    def draws(self, output: str) -> Drawn:
+        """Return weighted draws of an output by its column: of what happens, and of a reading.
+
+        They hold the doubt about the cause. Monte Carlo errors of what is asked of them are given
+        the causes' probabilities. A CalibError names the outputs there are.
+        """
+        if f"{output}_after" not in self.columns:
+            outputs = [n.removesuffix("_after") for n in self.columns if n.endswith("_after")]
+            raise CalibError(
+                f"the diagnosis has no output {output}", where="draws",
+                expected=", ".join(outputs), hint="name one of these columns",
+            )  # fmt: skip
+        truth = _truth(*self._made)[2]
+        nowhere = np.isnan(np.asarray(self.columns[f"{output}_after"], dtype=np.float64))
+        # Draws that were picked several times are one.
+        every = np.concatenate([*truth.truth.values()], axis=1)
+        same = np.unique(every, axis=0, return_inverse=True)[1].ravel()
+        effective = 1.0 / float(np.square(np.bincount(same, truth.weight)).sum())
+        name = next(o for o in truth.truth if OUTPUTS[o] == output)
+        mean, reading = (
+            Sample(np.where(nowhere, np.nan, v), Weights(truth.weight, same, effective))
+            for v in (truth.truth[name], truth.measured[name])
+        )
+        alone = not any(o.problem.noise.correlated_along for o in self._made[0].data.outputs)
+        return Drawn(self.conditions, mean, reading, together=alone)
 
     def __repr__(self) -> str:
         """Name the outputs, and say how many rows are outside."""
@@ -397,7 +433,8 @@ def predict_corrected(
 ) -> CorrectedPrediction:
     """Predict at new conditions; see `predict_columns`."""
     conditions = {n: v for n, v in table.columns.items() if n not in OUTPUTS.values()}
-    return CorrectedPrediction(conditions, predict_columns(corrected, table, left_out))
+    made = corrected, table, tuple(left_out)
+    return CorrectedPrediction(conditions, predict_columns(*made), _made=made)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,8 @@ from calib.data.checks import check_conditions
 from calib.data.reader import Tabular, index_of
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration
+from calib.inference.prior_files import PriorFile
+from calib.inference.problem import problem_without_data
 from calib.validation import prediction
 from calib.validation.prediction import Prediction
 
@@ -22,24 +24,31 @@ if TYPE_CHECKING:
 @overload
 def predict(found: Calibration, at: Tabular) -> Prediction: ...
 @overload
+def predict(found: str, at: Tabular, *, priors: PriorFile | str | None = None) -> Prediction: ...
+@overload
 def predict(
     found: Diagnosis, at: Tabular, without: Collection[str] = ()
 ) -> CorrectedPrediction: ...
 
 
 def predict(
-    found: Calibration | Diagnosis, at: Tabular, without: Collection[str] = ()
-) -> Prediction | CorrectedPrediction:
+    found: Calibration | Diagnosis | str, at: Tabular, without: Collection[str] = (),
+    *, priors: PriorFile | str | None = None,
+) -> Prediction | CorrectedPrediction:  # fmt: skip
     """Predict at the conditions of a table.
 
     Parameters
     ----------
-    found : Calibration or Diagnosis
+    found : Calibration, Diagnosis or str
+        The name of a model predicts what its priors expect, before there are data. Reference
+        conditions are then those of the table.
     at : Table, mapping of str to array_like, or pandas.DataFrame
         With the conditions, under column names with units. For a diagnosis also the covariates
         that its causes depend on.
     without : collection of str, optional
         Causes of a diagnosis that no longer act, as of an instrument that was mended.
+    priors : path or PriorFile, optional
+        Of a model; the shipped ones by default.
 
     Returns
     -------
@@ -49,7 +58,8 @@ def predict(
     ------
     CalibError
         If a condition is missing or looks as if it were in another unit, a cause is unknown, or
-        causes are left out of a calibration, which has none.
+        causes are left out of a calibration, which has none. If priors are given for what has
+        been calibrated.
 
     Examples
     --------
@@ -59,8 +69,19 @@ def predict(
     >>> bands = calib.predict(calibration, {"average_ground_pressure_kpa": [100.0, 150.0]})
     >>> bands.predictive.median.shape
     (2,)
+    >>> before = calib.predict("bekker", {"average_ground_pressure_kpa": [100.0, 150.0]})
+    >>> bool(before.predictive.upper[0.9][0] > bands.predictive.upper[0.9][0])
+    True
     """
     table = as_table(at)
+    if isinstance(found, str) and not without:
+        expected = prediction.predict_prior(problem_without_data(found, table, priors), table)
+        return replace(expected, index=index_of(at))
+    if priors is not None:
+        raise CalibError(
+            "priors are for a model, before it is calibrated", where="calib.predict",
+            expected="the name of a model", hint="leave `priors` out",
+        )  # fmt: skip
     if isinstance(found, Calibration):
         if without:
             raise CalibError(

@@ -8,6 +8,7 @@ from functools import cached_property
 from numbers import Integral
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.arguments import takes
 from calib.inference.diagnostics import convergence, ess, hdi, hdi_error, median_error
@@ -109,9 +110,12 @@ class Calibration(Shown):
 
     def subset(self, size: int) -> Array:
         """Evenly spaced draws in internal coordinates, shape (size, d)."""
-        flat = self.draws.flat
-        picked = np.linspace(0, flat.shape[0] - 1, min(size, flat.shape[0])).round().astype(int)
-        return np.asarray(flat[picked])
+        return np.asarray(self.draws.flat[self.picked(size)])
+
+    def picked(self, size: int) -> NDArray[np.intp]:
+        """Places of evenly spaced draws among `Draws.flat`, shape (size,)."""
+        n = len(self.draws.flat)
+        return np.linspace(0, n - 1, min(size, n)).round().astype(np.intp)
 
 
 def _summarise(calibration: Calibration) -> dict[str, ParameterSummary]:

@@ -213,10 +213,13 @@ class Noise:
         return natural[:, j : j + 1]
 
     def draw(
-        self, natural: Array, conditions: Mapping[str, Array], rng: np.random.Generator, n: int
-    ) -> Array:
-        """Draw the noise of n readings for each parameter vector, shape (k, n)."""
+        self, natural: Array, conditions: Mapping[str, Array], rng: np.random.Generator, n: int,
+        serial: Serial | None = None,
+    ) -> Array:  # fmt: skip
+        """Draw the noise of n readings, in an order or none, for each vector, shape (k, n)."""
         z = rng.standard_normal((natural.shape[0], n))
+        if serial is not None:
+            z = serial.correlate(z, self.own("rho", natural))
         if self.student:
             nu = self.own("nu", natural)
             z *= np.sqrt(nu / rng.chisquare(np.broadcast_to(nu, z.shape)))

@@ -53,7 +53,7 @@ from calib.inference.prior_files import (
 )
 from calib.inference.priors import Priors, prior_references
 from calib.inference.random import generator
-from calib.models import Array, BoundModel, Conditions, get_model
+from calib.models import Array, BoundModel, Conditions, Model, get_model
 from calib.models.simulators.declaration import simulated_by
 
 
@@ -303,11 +303,7 @@ class Problem:
 
     def draw_noise(self, natural: Array, rng: np.random.Generator) -> Array:
         """Draw the noise of the rows for each parameter vector, shape (k, n)."""
-        n, serial = self.response.size, self.serial
-        if serial is None:
-            return self.noise.draw(natural, self.conditions, rng, n)
-        z = serial.correlate(rng.standard_normal((len(natural), n)), self.noise.own("rho", natural))
-        return np.asarray(self.noise.scale(natural, self.conditions) * z)
+        return self.noise.draw(natural, self.conditions, rng, self.response.size, self.serial)
 
     def log_likelihood_rows(self, t: Array) -> Array:
         """Log likelihood of every row by itself, shape (k, n)."""
@@ -382,37 +378,14 @@ def build_problem(
     """
     model, table = get_model(model_name), as_table(table)
     table.must_have(*model.conditions, model.output)
-    references = prior_references(table.columns)
-    own = Path(prior_path) if isinstance(prior_path, str) else prior_path
-    priors = read_priors(
-        own or default_priors(model.name),
-        model.name,
-        (*model.parameters, "sigma"),
-        references,
-    )
+    priors = _priors_of(model, table, prior_path)
     # With some parameters held, a fit still needs more rows than its equation has parameters.
     estimated = {p.name for p in priors.free} - {*(fixed or ())}
     least = max(len(estimated), len(model.parameters))
     check_enough(table, max(least - others, 2), model=model.name)
     check_varies(table, model.output)
     check_settings(table, model.conditions)
-    relative = relative_columns(priors.text)
-    check_units(table, (*model.conditions, model.output, *relative))
-    try:
-        bound = model.bind(table.columns)
-    except CalibError as error:
-        raise error.within(table.source) from None
-    assumed = {name: value for name, value in relative.items() if name not in references}
-    notes = [note] if (note := inheritance_note(priors, model.name)) else []
-    notes += [
-        f"the data have no column {name}, so priors that are relative to it assume "
-        f"{_with_unit(name, value)}; give it if yours differs"
-        for name, value in assumed.items()
-    ]
-    noise = noise_of(priors.noise, model.select(table.columns), priors.source)
-    if model.uncertain is not None:
-        noise.must_be_iid_normal(priors.source, f"the emulator {model.name}")
-    problem = Problem(bound, table, priors, tuple(notes), noise)
+    problem, assumed = _set_up(model, table, priors)
     _ = problem.serial  # refused here, not in the middle of an estimation
     problem = problem.with_fixed(fixed) if fixed else problem
     if not problem.names:
@@ -425,3 +398,53 @@ def build_problem(
     if model.uncertain is not None or simulated_by(model.name) is None:
         check_scale(problem, assumed)
     return problem
+
+
+def _priors_of(model: Model, table: Table, path: PriorFile | str | None) -> Priors:
+    own = Path(path) if isinstance(path, str) else path
+    names = (*model.parameters, "sigma")
+    references = prior_references(table.columns)
+    return read_priors(own or default_priors(model.name), model.name, names, references)
+
+
+def _set_up(model: Model, table: Table, priors: Priors) -> tuple[Problem, dict[str, float]]:
+    """Bind a model to a table; what priors are relative to and it lacks is assumed."""
+    relative = relative_columns(priors.text)
+    check_units(table, (*model.conditions, model.output, *relative))
+    try:
+        bound = model.bind(table.columns)
+    except CalibError as error:
+        raise error.within(table.source) from None
+    assumed = {
+        name: value
+        for name, value in relative.items()
+        if name not in prior_references(table.columns)
+    }
+    notes = [note] if (note := inheritance_note(priors, model.name)) else []
+    notes += [
+        f"the data have no column {name}, so priors that are relative to it assume "
+        f"{_with_unit(name, value)}; give it if yours differs"
+        for name, value in assumed.items()
+    ]
+    noise = noise_of(priors.noise, model.select(table.columns), priors.source)
+    if model.uncertain is not None:
+        noise.must_be_iid_normal(priors.source, f"the emulator {model.name}")
+    return Problem(bound, table, priors, tuple(notes), noise), assumed
+
+
+@takes(model_name=str, prior_path=(PathLike, DeclaredPriors))
+def problem_without_data(
+    model_name: str, at: Tabular, prior_path: PriorFile | str | None = None
+) -> Problem:
+    """Bind a model to conditions and read its priors, to predict before there are data.
+
+    Conditions stand for data in what priors refer to: reference conditions, and columns that they
+    are relative to. Its `notes` say so. A CalibError names a condition that is missing, as in
+    another unit, or does not vary where the model needs it to.
+    """
+    model, table = get_model(model_name), as_table(at)
+    table.must_have(*model.conditions)
+    problem, _ = _set_up(model, table, _priors_of(model, table, prior_path))
+    said = ", ".join(f"{n} {plain_number(v)}" for n, v in problem.bound.references.items())
+    own = f"the parameters refer to the conditions that are predicted at: {said}"
+    return replace(problem, notes=(*problem.notes, own) if said else problem.notes)

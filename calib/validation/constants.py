@@ -6,6 +6,8 @@ from __future__ import annotations
 LEVELS = (0.5, 0.9, 0.95)
 # Predictive draws; an error of 0.3 % in a 95 % level; test_prediction.
 N_DRAWS = 4000
+# Blocks of draws whose means give Monte Carlo errors, known themselves to a fifth; test_questions.
+BLOCKS = 16
 # Part of the posterior that must have a value for a band to be given; test_prediction.
 MIN_DEFINED = 0.95
 # Pareto k above which importance sampling cannot leave a row out (Vehtari et al. 2024);

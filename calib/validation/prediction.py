@@ -8,21 +8,35 @@ for independent rows.
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.special import bdtr, ndtri
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import bdtr, ndtr, ndtri
 
 from calib.batch.environment import one_thread
 from calib.data import Table
 from calib.data.checks import stretches
+from calib.errors import CalibError
+from calib.inference.likelihood import serial_of
 from calib.inference.random import generator
 from calib.models.base import Array
 from calib.shown import Shown
-from calib.validation.constants import LEVELS, MIN_DEFINED, N_DRAWS
+from calib.validation.constants import BLOCKS, LEVELS, MIN_DEFINED, N_DRAWS
+from calib.validation.questions import (
+    Both,
+    Chance,
+    Drawn,
+    Levels,
+    Peak,
+    Probability,
+    Sample,
+    Weights,
+    asked,
+    quantiles,
+)
 
 if TYPE_CHECKING:
     from calib.inference.calibration import Calibration
@@ -36,6 +50,89 @@ class Bands:
     median: Array
     lower: Mapping[float, Array]
     upper: Mapping[float, Array]
+
+
+@dataclass(frozen=True)
+class Part:
+    """Draws of one problem's parameters, (size, d_all), that a prediction is made from.
+
+    Which are alike, how many independent ones say as much, the seed and labels of their random
+    numbers, and what tells the posterior that they are of, a joint one of several outputs perhaps.
+    """
+
+    problem: Problem
+    natural: Array
+    block: NDArray[np.intp]
+    effective: float
+    seed: int
+    labels: tuple[str | int, ...]
+    posterior: tuple[object, ...]
+
+
+def _part(calibration: Calibration, size: int, *labels: str | int) -> Part:
+    """Take evenly spaced draws of a calibration; walkers move alike, ensembles do not."""
+    draws, report, problem = calibration.draws, calibration.draws.report, calibration.problem
+    ensembles, walkers, steps, _ = draws.t.shape
+    picked = calibration.picked(size)
+    parts = max(1, min(BLOCKS // ensembles, steps))
+    block = picked // (walkers * steps) * parts + picked % steps * parts // steps
+    # Of chains that are too short to tell, one.
+    ess = np.nan_to_num(np.append(report.ess_bulk, report.ess_tail), nan=1.0).min()
+    return Part(
+        problem, problem.theta(draws.flat[picked]), np.unique(block, return_inverse=True)[1],
+        min(float(picked.size), max(float(ess), 1.0)), calibration.seed,
+        (calibration.label, *labels), (calibration.seed, draws.evaluations, draws.seconds),
+    )  # fmt: skip
+
+
+def _weights(parts: Sequence[Part]) -> Weights:
+    """Of the draws of all parts, which count alike; blocks hold some of every part."""
+    block = np.concatenate([p.block for p in parts])
+    effective = block.size**2 / sum(len(p.natural) ** 2 / p.effective for p in parts)
+    return Weights(np.full(block.size, 1.0 / block.size), block, effective)
+
+
+type _Found = list[tuple[Part, dict[str, Array], Array]]
+
+
+def _locations(
+    parts: Sequence[Part], table: Table, at_once: int = 2000, least: float = MIN_DEFINED
+) -> Iterator[tuple[slice, Array, _Found]]:
+    """Yield some rows at a time, the share of draws with a value, each part's mean responses."""
+    for start in range(0, len(table), at_once):
+        rows, found = slice(start, start + at_once), []
+        for part in parts:
+            columns = part.problem.bound.model.select(table.columns)
+            at = {name: v[rows] for name, v in columns.items()}
+            error = generator(part.seed, *part.labels, "emulator")  # an emulator's error, too
+            found.append((part, at, part.problem.draw_mean_response(part.natural, at, error)))
+        share = np.isfinite(np.concatenate([y for _, _, y in found])).mean(axis=0)
+        # Where many plausible parameters give the equation no value (a quadratic in pressure
+        # extrapolated below zero), the rest are no sample of anything: no value is better.
+        kept = [(part, at, np.where(share >= least, y, np.nan)) for part, at, y in found]
+        yield rows, share, kept
+
+
+def _quantiles(parts: Sequence[Part], table: Table, q: Levels) -> tuple[Array, Array, Array]:
+    """Quantiles of mean and reading, (q, n), and the part of the draws with a value, (n,)."""
+    normals = []
+    for part in parts:
+        # The same noise draws for every row: its bands do not depend on the other rows. Evenly
+        # spread over their quantiles, in random order, four for each draw of the parameters.
+        rng, size = generator(part.seed, *part.labels), len(part.natural)
+        spread = ((rng.permutation(size) + rng.uniform(size=size)) / size for _ in range(4))
+        normals.append([ndtri(u)[:, None] for u in spread])
+    done = []
+    for _, share, found in _locations(parts, table):
+        means, readings = [], []
+        for (part, at, location), zs in zip(found, normals, strict=True):
+            back, noise = part.problem.bound.from_response, part.problem.noise
+            means.append(back(location))
+            readings += [back(location + noise.of_normal(part.natural, at, z)) for z in zs]
+        both = (quantiles(np.concatenate(v), q) for v in (means, readings))
+        done.append((*both, share))
+    mean, reading, share = (np.concatenate(v, axis=-1) for v in zip(*done, strict=True))
+    return mean, reading, share
 
 
 @dataclass(frozen=True, repr=False)
@@ -68,6 +165,8 @@ class Prediction(Shown):
     outside: tuple[tuple[str, ...], ...]
     defined: Array
     index: tuple[object, ...] | None = None
+    _parts: tuple[Part, ...] = field(kw_only=True)
+    _table: Table = field(kw_only=True)
 
     def __repr__(self) -> str:
         """Name the output, and say how many rows there are and how many are outside."""
@@ -76,6 +175,162 @@ class Prediction(Shown):
             f"<Prediction of {self.output} at {len(self.outside)} rows, {outside} outside the "
             "calibrated range>"
         )
+
+    def probability(self, sign: str, value: ArrayLike) -> Probability:
+        """Return how probably the output lies above or below a value, with Monte Carlo errors.
+
+        Parameters
+        ----------
+        sign : {">", "<"}
+        value : float or array_like, shape (n,)
+            In the unit of `output`: one for all rows, or one for each.
+
+        Returns
+        -------
+        Probability
+            Of the mean curve and of a new reading, in each row and in all rows at once.
+
+        Raises
+        ------
+        CalibError
+            If the value is no number.
+
+        Examples
+        --------
+        >>> import calib
+        >>> plates = calib.load_he2019("rut_depth")
+        >>> calibration = calib.calibrate(calib.build_problem("bekker", plates), seed=1)
+        >>> ruts = calib.predict(calibration, {"average_ground_pressure_kpa": [100.0, 150.0]})
+        >>> deep = ruts.probability(">", 25.0)
+        >>> bool(deep.mean.value[0] < deep.reading.value[0] < deep.reading.value[1])
+        True
+        """
+        weights, (over, limit) = _weights(self._parts), asked(sign, value, len(self._table))
+        everywhere, rows = np.ones((2, weights.block.size)), []
+        for some, _, found in _locations(self._parts, self._table):
+            values: list[list[Array]] = [[], []]
+            for part, at, location in found:
+                bound = part.problem.bound
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    # All that has a logarithm is above zero.
+                    least = (bound.model.response == "log") & (limit[some] <= 0.0)
+                    left = np.where(least, -np.inf, bound.to_response(limit[some])) - location
+                z = part.problem.noise.normal_scores(left, part.natural, at)
+                values[0].append(np.where(np.isnan(left), np.nan, (left < 0.0) == over))
+                values[1].append(ndtr(-z if over else z))
+            both = [np.concatenate(v) for v in values]
+            everywhere *= [v.prod(axis=1) for v in both]
+            rows.append([weights.chance(v) for v in both])
+        if len(self._table) > 1 and any(p.problem.noise.correlated_along for p in self._parts):
+            everywhere[1] = np.nan
+        mean, reading = (
+            Chance(*map(np.concatenate, zip(*of, strict=True))) for of in zip(*rows, strict=True)
+        )
+        return Probability(mean, reading, *map(weights.chance, everywhere))
+
+    def quantile(self, q: Levels) -> Both:
+        """Return quantiles of the mean curve and of a new reading, (n,), or (q, n) of several.
+
+        A CalibError names levels that are not between 0 and 1.
+        """
+        return Both(*_quantiles(self._parts, self._table, q)[:2])
+
+    def draws(self, size: int = 1000) -> Drawn:
+        """Return draws of the mean curve and of a new reading in each row, (size, n).
+
+        In one draw all rows have the same parameters, so any function of rows may be formed of it.
+        They are evenly spaced among the 4000 that bands are made from. A CalibError says if noise
+        is correlated along a column that the conditions do not have.
+        """
+        conditions, means, readings = dict[str, Array](), [], []
+        n = len(self._table)
+        for _, _, found in _locations(self._parts, self._table, n):
+            for part, at, location in found:
+                noise, back = part.problem.noise, part.problem.bound.from_response
+                order = serial_of(noise.correlated_along, self._table) if n > 1 else None
+                drawn = noise.draw(
+                    part.natural, at, generator(part.seed, *part.labels, "draws"), n, order
+                )
+                means.append(back(location))
+                readings.append(back(location + drawn))
+                conditions |= at
+        weights = _weights(self._parts)
+        mean, reading = (Sample(np.concatenate(v), weights) for v in (means, readings))
+        return Drawn(conditions, mean, reading).draws(size)
+
+    def peak(self, over: str) -> Peak:
+        """Find where the mean is largest along a condition; see `Drawn.peak`."""
+        return self.draws(N_DRAWS).peak(over)
+
+
+def combine(
+    predictions: Mapping[str, Prediction], function: Callable[..., Array], size: int = 1000
+) -> Drawn:
+    """Form a function of several outputs, draw by draw, such as an efficiency of pull and torque.
+
+    Outputs of one joint posterior share their parameters draw by draw. Separate fits are taken for
+    independent, which those of data in common are not.
+
+    Parameters
+    ----------
+    predictions : mapping of str to Prediction
+        At the same rows, by the names of the function's arguments.
+    function : callable
+        ``(**outputs) -> (size, m)``, each output (size, n) in the unit of its prediction.
+
+    Returns
+    -------
+    Drawn
+        The function of the means and of new readings, whose noise is independent.
+
+    Raises
+    ------
+    CalibError
+        If the predictions differ in their rows, or the function returns another shape.
+
+    Examples
+    --------
+    >>> import calib
+    >>> from calib.validation.prediction import combine
+    >>> ruts = calib.load_he2019("rut_depth")
+    >>> calibration = calib.calibrate(calib.build_problem("bekker", ruts), seed=1)
+    >>> found = calib.predict(calibration, {"average_ground_pressure_kpa": [100.0, 150.0]})
+    >>> deeper = combine({"rut": found}, lambda rut: rut[:, 1:] - rut[:, :1])
+    >>> float(deeper.mean.probability(">", 0.0).value[0])
+    1.0
+    """
+    drawn = {name: p.draws(size) for name, p in predictions.items()}
+    conditions = {n: v for d in drawn.values() for n, v in d.conditions.items()}
+    alike = all(
+        np.array_equal(v, conditions[n]) for d in drawn.values() for n, v in d.conditions.items()
+    )
+    if not alike or len({d.mean.values.shape for d in drawn.values()}) != 1:
+        raise CalibError(
+            "the predictions differ in their rows or draws", where="combine",
+            expected="one or more predictions at the same conditions, of as many draws",
+            hint="predict all rows in one table; columns of its draws are its rows",
+        )  # fmt: skip
+    known = dict[object, int]()
+    arguments: tuple[dict[str, Array], dict[str, Array]] = ({}, {})
+    for name, d in drawn.items():
+        posterior = tuple(part.posterior for part in predictions[name]._parts)
+        # Chains of one seed might move alike: posteriors of their own are paired at a distance.
+        by = known.setdefault(posterior, len(known)) * len(d.mean.values) // len(drawn)
+        for values, of in zip(arguments, (d.mean, d.reading), strict=True):
+            values[name] = np.roll(of.values, by, axis=0)
+    least = min((d.mean.weights for d in drawn.values()), key=lambda w: w.effective)
+    samples = []
+    for values in arguments:
+        with np.errstate(all="ignore"):
+            found = np.asarray(function(**values), dtype=np.float64)
+        if found.ndim != 2 or len(found) != least.block.size:
+            raise CalibError(
+                f"the function returned the shape {found.shape}", where="combine",
+                expected=f"({least.block.size}, rows): a value of every draw",
+                hint="work on whole arrays, whose first axis is that of the draws",
+            )  # fmt: skip
+        samples.append(Sample(found, least))
+    return Drawn(conditions, samples[0], samples[1])
 
 
 @one_thread()
@@ -99,113 +354,69 @@ def prior_predictive(problem: Problem, rng: np.random.Generator) -> Array:
     return problem.bound.from_response(location + problem.draw_noise(natural, rng))
 
 
+def predict(calibration: Calibration, table: Table) -> Prediction:
+    """Predict at the conditions of a table; a CalibError names one that is missing."""
+    return _predicted((_part(calibration, N_DRAWS, "predict"),), table)
+
+
 def predict_stacked(parts: Sequence[tuple[float, Calibration]], table: Table) -> Prediction:
     """Predict with the mixture of several calibrations of one output, weights first, of sum 1.
 
     Each gives as many of the `N_DRAWS` draws as is its weight. A CalibError names a condition of
     one that has any and the table has not.
     """
-    used = [(weight, c) for weight, c in parts if round(weight * N_DRAWS) > 0]
-    means, measured, outer = [], [], []
-    conditions: dict[str, Array] = {}
-    for weight, c in used:
-        own = c.problem.bound.model.select(table.columns)
-        rng = generator(c.seed, c.label, "predict stacked")
-        mean, reading = predictive_draws(c, own, rng, round(weight * N_DRAWS))
-        means.append(mean)
-        measured.append(reading)
-        outer.append(outside(c.problem.conditions, own))
+    sizes = [(round(weight * N_DRAWS), c) for weight, c in parts]
+    found = (_part(c, size, "predict stacked", i) for i, (size, c) in enumerate(sizes) if size)
+    return _predicted(tuple(found), table)
+
+
+def predict_prior(problem: Problem, table: Table) -> Prediction:
+    """Predict at the conditions of a table what the priors expect, without any data.
+
+    As a fit does, they keep out of where the equation has no value in one of the rows, unless that
+    is most of them.
+    """
+    labels, size = (problem.bound.model.name, "prior"), 2 * N_DRAWS
+    natural = problem.theta(problem.priors.sample(generator(0, *labels, "parameters"), size))
+    good = np.ones(size, dtype=np.bool_)
+    every = Part(problem, natural, np.zeros(size, np.intp), 1.0, 0, labels, labels)
+    for _, _, ((_, _, location),) in _locations([every], table, least=0.0):
+        good &= np.isfinite(location).all(axis=1)
+    natural = natural[good if good.sum() >= N_DRAWS else slice(None)][:N_DRAWS]
+    block = np.arange(N_DRAWS) * BLOCKS // N_DRAWS
+    part = Part(problem, natural, block, float(N_DRAWS), 0, labels, labels)
+    return _predicted((part,), table, prior=True)
+
+
+def _predicted(parts: tuple[Part, ...], table: Table, *, prior: bool = False) -> Prediction:
+    conditions, outer = dict[str, Array](), list[tuple[tuple[str, ...], ...]]()
+    for part in parts:
+        own = part.problem.bound.model.select(table.columns)
         conditions |= own
-    whole = np.concatenate(means)
-    share = np.isfinite(whole).mean(axis=0)
-    kept = np.where(share >= MIN_DEFINED, 0.0, np.nan)
-    flags = (
-        tuple(dict.fromkeys(name for f in row for name in f)) for row in zip(*outer, strict=True)
-    )
+        outer.append(outside(own if prior else part.problem.conditions, own))
+    mean, reading, share = _quantiles(parts, table, _EDGES)
+    flags = (tuple(dict.fromkeys(n for f in row for n in f)) for row in zip(*outer, strict=True))
     return Prediction(
-        used[0][1].problem.bound.model.output, conditions, bands(whole + kept),
-        bands(np.concatenate(measured) + kept), tuple(flags), share,
+        parts[0].problem.bound.model.output, conditions, _bands(mean), _bands(reading),
+        tuple(flags), share, _parts=parts, _table=table,
     )  # fmt: skip
 
 
-def predict(calibration: Calibration, table: Table) -> Prediction:
-    """Predict at the conditions of a table.
-
-    Parameters
-    ----------
-    calibration : Calibration
-    table : Table
-        With the model's conditions.
-
-    Returns
-    -------
-    Prediction
-
-    Raises
-    ------
-    CalibError
-        If a condition is missing.
-    """
-    model = calibration.problem.bound.model
-    conditions = model.select(table.columns)
-    problem = calibration.problem
-    natural = problem.theta(calibration.subset(N_DRAWS))
-    # The same noise draws for every row: its bands do not depend on the other rows.
-    rng = generator(calibration.seed, calibration.label, "predict")
-    # Evenly spread over their quantiles, in random order, four for each draw of the parameters.
-    size = natural.shape[0]
-    normals = [
-        ndtri((rng.permutation(size) + rng.uniform(size=size)) / size)[:, None] for _ in range(4)
-    ]
-    parts = []
-    at_once = 2000  # rows; of 4000 draws each
-    for start in range(0, len(table), at_once):
-        rows = {name: v[start : start + at_once] for name, v in conditions.items()}
-        # An emulator's error, too.
-        error = generator(calibration.seed, calibration.label, "predict", "emulator")
-        location = problem.draw_mean_response(natural, rows, error)
-        share = np.isfinite(location).mean(axis=0)
-        # Where many plausible parameters give the equation no value (a quadratic in pressure
-        # extrapolated below zero), the rest are no sample of anything: no value is better.
-        location = np.where(share >= MIN_DEFINED, location, np.nan)
-        back = problem.bound.from_response
-        noises = (problem.noise.of_normal(natural, rows, z) for z in normals)
-        measured = np.concatenate([back(location + noise) for noise in noises])
-        parts.append((bands(back(location)), bands(measured), share))
-    return Prediction(
-        model.output,
-        conditions,
-        _join([p[0] for p in parts]),
-        _join([p[1] for p in parts]),
-        outside(problem.conditions, conditions),
-        np.concatenate([p[2] for p in parts]),
-    )
+_EDGES = [0.5, *(0.5 + half * level for half in (-0.5, 0.5) for level in LEVELS)]
 
 
-def _join(parts: Sequence[Bands]) -> Bands:
+def _bands(edges: Array) -> Bands:
+    k = len(LEVELS)
     return Bands(
-        np.concatenate([b.median for b in parts]),
-        {level: np.concatenate([b.lower[level] for b in parts]) for level in LEVELS},
-        {level: np.concatenate([b.upper[level] for b in parts]) for level in LEVELS},
+        edges[0],
+        dict(zip(LEVELS, edges[1 : 1 + k], strict=True)),
+        dict(zip(LEVELS, edges[1 + k :], strict=True)),
     )
 
 
 def bands(draws: Array) -> Bands:
     """Median and central bands of draws, shape (size, n)."""
-    edges = [0.5, *(0.5 + half * level for half in (-0.5, 0.5) for level in LEVELS)]
-    quantiles = np.quantile(draws, edges, axis=0)
-    if np.isnan(quantiles).any():
-        # A parameter vector for which the equation has no value there is left out, not spread;
-        # where none has a value, neither have the bands.
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "All-NaN slice", RuntimeWarning)
-            quantiles = np.nanquantile(draws, edges, axis=0)
-    k = len(LEVELS)
-    return Bands(
-        quantiles[0],
-        dict(zip(LEVELS, quantiles[1 : 1 + k], strict=True)),
-        dict(zip(LEVELS, quantiles[1 + k :], strict=True)),
-    )
+    return _bands(quantiles(draws, _EDGES))
 
 
 def smooth_bands(

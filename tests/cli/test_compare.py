@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from calib.batch.folders import check_folder
+from calib.imports.tables import read_raw
 from calib.models import example_csv
 from calib.report.comparison import table
 from tests.browser import Browser, faults
@@ -30,9 +31,14 @@ def test_models_are_compared_and_the_stack_predicts(calib: Calib) -> None:
     assert abs(sum(m["weight"] for m in found["models"].values()) - 1.0) < 1e-9
     assert all(m["held_out"]["rows"] == 4 for m in found["models"].values())
     assert "figures/bands.png" in {p.relative_to("c").as_posix() for p in Path("c").rglob("*")}
-    told = calib("predict", "c", "--at", "plates.csv", "--out", "bands.csv")
+    told = calib("predict", "c", "--at", "plates.csv", "--out", "bands.csv", "--exceeds",
+                 "rut_depth_mm=20", "--draws", 50)  # fmt: skip
     assert told.code == (0 if found["converged"] else 3), told.err
     assert "rut_depth_mm_predictive_90_lower" in Path("bands.csv").read_text()
+    answer = read_raw("bands.csv").frame
+    deep, drawn = answer["rut_depth_mm_reading_above_20"], read_raw("bands_draws.csv").frame
+    share = drawn.groupby("row")["rut_depth_mm_reading"].agg(lambda v: (v > 20.0).mean())
+    np.testing.assert_allclose(share, deep, atol=5.0 * np.sqrt(0.25 / 50))
     again = calib("compare", "reece", "bekker_plate", "plates.csv", "--out", "c", *FEW)
     assert again.code == 2
     assert "--overwrite" in again.err

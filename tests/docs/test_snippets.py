@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 import shlex
 import tomllib
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +35,9 @@ def follow(page: str, run: Calib, *, slow: bool) -> None:
         elif block.language == "python":
             # So that a traceback names the line of the page.
             code = "\n" * (block.line - 1) + block.text
-            exec(compile(code, page, "exec"), names)
-            printed = ""
+            with redirect_stdout(StringIO()) as output:
+                exec(compile(code, page, "exec"), names)
+            printed = output.getvalue()
         elif block.language == "toml":
             tomllib.loads(block.text)
         elif block.language == "text" and printed:

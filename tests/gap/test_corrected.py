@@ -33,6 +33,7 @@ from calib.gap.forward import Forward
 from calib.gap.hypotheses import Hypothesis, joined, singles
 from calib.gap.mixture import Mixture, Truth, mixture
 from calib.gap.noise import Noise
+from calib.gap.predict import predict
 from calib.gap.ranking import rank
 from calib.inference.prior_files import DeclaredPriors, default_priors
 from tests.gap.cases import LARGE, PULL_ONLY, campaigns_of, diagnosis_of, make_case, write_case
@@ -281,6 +282,48 @@ def test_conditions_beyond_both_campaigns_are_named(saved):
     predicted = predict_columns(load_corrected(folder), table_from_arrays(fast))
     assert predicted[flags] == ["speed_m_s", *[""] * 26]
     assert list(predicted)[-1] == flags
+
+
+def test_a_diagnosis_answers_with_the_doubt_about_its_cause(saved, tmp_path):
+    found, folder = saved
+    table = found.data.case.field
+    predicted = predict(found, table)
+    drawn = predicted.draws("drawbar_pull_kn")
+    low, high = drawn.quantile([0.05, 0.95]).reading
+    # Of 1200 draws, to the distance of one from the next.
+    np.testing.assert_allclose(low, predicted.columns["drawbar_pull_kn_after_lower"], rtol=2e-3)
+    np.testing.assert_allclose(high, predicted.columns["drawbar_pull_kn_after_upper"], rtol=2e-3)
+    at_mean = drawn.probability(">", predicted.columns["drawbar_pull_kn_after"])
+    # Nearly symmetric, so the mean is nearly the median.
+    np.testing.assert_allclose(at_mean.mean.value, 0.5, atol=0.15)
+    assert ((at_mean.mean.error > 0.005) & (at_mean.mean.error < 0.1)).all()
+    # Draws of one weight have the mean of all, to their own scatter.
+    few = drawn.draws(400).mean.values
+    error = few.std(axis=0) / 20.0
+    before = drawn.mean.weights.weight @ drawn.mean.values
+    assert (np.abs(few.mean(axis=0) - before) < 5.0 * error).all()
+    with pytest.raises(CalibError, match="no output torque"):
+        predicted.draws("torque")
+    write_table(tmp_path / "at.csv", dict(table.columns))
+    asked = ["--exceeds", "drawbar_pull_n=900", "--quantiles", "0.5", "--json"]
+    given = ["predict", str(folder), "--at", str(tmp_path / "at.csv"), *asked]
+    told = json.loads(CliRunner().invoke(app, given).stdout)
+    over = drawn.probability(">", 0.9)
+    column = told["columns"]["drawbar_pull_n_mean_above_900"]
+    np.testing.assert_allclose(column, over.mean.value, atol=1e-9)
+    assert told["everywhere"][0]["mean"] == pytest.approx(float(over.mean_everywhere.value))
+    setting = {name: values[:1] for name, values in table.columns.items()}
+    ends = {name: np.repeat(values, 2) for name, values in setting.items()}
+    write_table(tmp_path / "curve.csv", ends | {"slip_ratio": np.array([0.02, 0.6])})
+    asked = ["--peak-over", "slip_ratio", "--json"]
+    given = ["predict", str(folder), "--at", str(tmp_path / "curve.csv"), *asked]
+    (peak,) = json.loads(CliRunner().invoke(app, given).stdout)["columns"][
+        "drawbar_pull_kn_peak_median"
+    ]
+    slip = np.linspace(0.02, 0.6, 30)
+    curve = {name: np.repeat(values, 30) for name, values in setting.items()}
+    along = predict(found, curve | {"slip_ratio": slip}).draws("drawbar_pull_kn")
+    assert peak == pytest.approx(float(along.quantile(0.5).mean.max()), rel=0.02)
 
 
 def test_an_effect_of_ones_own_is_passed_to_predict(tmp_path, capsys):
