@@ -8,7 +8,7 @@ OUT ?= out/he2019
 # Small matrices: threads of the linear algebra would only wait for each other.
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: report reference test test-slow coverage browser docs bench lint format install-check release-check clean
+.PHONY: report reference test test-slow coverage browser crates docs bench lint format install-check release-check clean
 
 report: $(READY)
 	$(BIN)/calib report --out $(OUT) --overwrite
@@ -40,6 +40,11 @@ browser:
 	@command -v chromium chromedriver >/dev/null || \
 	  { apt-get update -qq && apt-get install -yqq chromium chromium-driver >/dev/null; }
 	@npm install --no-save --no-package-lock --no-audit --no-fund --silent axe-core@4.14.1
+
+# What accepts research objects, in an environment of its own: it needs another rich. Tests with it are left out without.
+crates: $(READY)
+	@test -x .venv-crates/bin/rocrate-validator || { $(BIN)/python -m venv --clear .venv-crates && \
+	  .venv-crates/bin/python -m pip install --quiet --disable-pip-version-check roc-validator==0.13.0; }
 
 # Static pages in out/docs, made from docs/ and the declarations; warnings are errors.
 docs: $(VENV)/.docs
@@ -118,4 +123,4 @@ release-check: install-check
 	$(RELEASE)/oldest/bin/python -m pytest -q -o filterwarnings= -W ignore $(OLDEST_TESTS)
 
 clean:
-	rm -rf $(VENV) $(BENCH_VENV) out
+	rm -rf $(VENV) $(BENCH_VENV) .venv-crates out

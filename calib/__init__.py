@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from calib.models.tir import TyreFile, read_tir
     from calib.report.gap_words import gap_verdict
     from calib.report.verdict import Verdict, verdict
+    from calib.validation.consistency import Consistency, consistency
     from calib.validation.prediction import Prediction
     from calib.validation.validate import Validation, leave_one_out, validate_held_out
 
@@ -69,6 +70,7 @@ _HOME = {
     "calib.report.gap_words": "gap_verdict",
     "calib.report.verdict": "Verdict verdict",
     "calib.validation.comparison": "Comparison compare",
+    "calib.validation.consistency": "Consistency consistency",
     "calib.validation.prediction": "Prediction",
     "calib.validation.validate": "Validation leave_one_out validate_held_out",
 }
@@ -80,6 +82,7 @@ __all__ = [
     "Calibration",
     "Case",
     "Comparison",
+    "Consistency",
     "Diagnosis",
     "Effect",
     "Emulation",
@@ -99,6 +102,7 @@ __all__ = [
     "calibrate",
     "check",
     "compare",
+    "consistency",
     "diagnose",
     "emulated",
     "estimate",
@@ -143,6 +147,7 @@ _UNLISTED = [
     "Calibration",
     "Case",
     "Comparison",
+    "Consistency",
     "Diagnosis",
     "Emulation",
     "Imported",
@@ -153,6 +158,7 @@ _UNLISTED = [
     "TyreFile",
     "Validation",
     "Verdict",
+    "consistency",
     "estimate",
     "read_plan",
     "read_tir",

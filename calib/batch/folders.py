@@ -33,6 +33,7 @@ _RECORDS: Mapping[str, tuple[str, ...]] = {
         "document.json", "corrected.json", "fresh_prediction.csv", "inputs.json", "case",
         "emulators", "index.html", "figures",
     ),
+    "review.json": ("index.html",),
     "audit.json": ("audit.csv", "index.html", "figures"),
     "score.txt": ("levels.png", "reliability_easy.png", "reliability_hard.png"),
 }  # fmt: skip

@@ -148,6 +148,20 @@ class Outcome:
         return 1 if self.of(Status.DIFFERENT) else 0
 
     @property
+    def groups(self) -> dict[str, tuple[dict[Status, int], float]]:
+        """How many items of each group have which status, and the largest difference of allowed."""
+        groups: dict[str, list[Item]] = {}
+        for item in self.items:
+            groups.setdefault(item.group.partition(" (")[0], []).append(item)
+        return {
+            name: (
+                {status: sum(item.status is status for item in items) for status in Status},
+                max((item.share or 0.0 for item in items), default=0.0),
+            )
+            for name, items in groups.items()
+        }
+
+    @property
     def draws_differ(self) -> bool:
         """Whether the posterior was drawn by other random draws than those recorded."""
         return any(item.other_draws for item in self.of(Status.WITHIN))

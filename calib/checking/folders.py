@@ -100,6 +100,12 @@ def files_in(folder: Path) -> set[str]:
     return {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
 
 
+def labels_in(folder: Path) -> list[str]:
+    """Return what data must be called, as the documents of a folder state it."""
+    texts = [path.read_text("utf-8", "replace") for path in folder.rglob("*.json")]
+    return [name for name in KNOWN_DATA if any(f'label": "{name}"' in text for text in texts)]
+
+
 def _listed(path: Path, own: str, name: str, expected: str) -> Item:
     if not expected:
         return claim(INPUTS, name, f"{own} has no hash of it")

@@ -103,6 +103,7 @@ _COMMANDS: Mapping[str, Mapping[Callable[..., None], str]] = {
     },
     "Verify": {
         check.check: "check run --json > check.json",
+        check.validate: "validate run my.csv",
         check.doctor: "doctor --quick",
         check.audit: "audit --out audit",
         campaign.sbc: "sbc --model bekker --simulations 100 --out sbc",

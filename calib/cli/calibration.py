@@ -50,6 +50,14 @@ def report(
     posteriors: Annotated[
         bool, typer.Option(help="Keep the posteriors (several megabytes of netCDF) in the folder.")
     ] = True,
+    reviewer: Annotated[
+        bool,
+        typer.Option(
+            "--reviewer",
+            help="Instead, check the folder that is given, and write one "
+            "page for a reviewer; without any, of the source paper.",
+        ),
+    ] = False,
     views: Annotated[
         bool,
         typer.Option(help="Write page, figures and tables as well as the numbers."),
@@ -72,6 +80,12 @@ def report(
     from calib.report.verdict import judge_evidence
     from calib.report.writer import write_report
 
+    if reviewer:
+        # Without a folder, of what `calib report` writes without --out.
+        folders, usual = files or [Path("calib-report")], out == Path("calib-report")
+        out = Path("calib-review") if usual else out
+        _review(ctx, folders, out, workers, overwrite=overwrite)
+        return
     ctx.with_resource(claimed(out, overwrite=overwrite))
     title = "Calibration report"
     sections: list[Section[Any]] = []
@@ -150,6 +164,26 @@ def report(
     good = converged and all(e.passed for e in emulations.values())
     code = 1 if study.failures else 0 if good else 3
     finish(code, out / "summary.json", folder=str(out), verdicts=verdicts)
+
+
+def _review(
+    ctx: typer.Context, folders: list[Path], out: Path, workers: int, *, overwrite: bool
+) -> None:
+    """Write the page for a reviewer of a folder."""
+    from calib.batch.folders import claimed, fresh_folder
+    from calib.checking.review import FILE, review, write_review
+    from calib.cli.check import run_check
+
+    if len(folders) != 1:
+        raise CalibError("there are several folders to review", hint="review each by itself")
+    ctx.with_resource(claimed(out, overwrite=overwrite))
+    outcome = run_check(folders[0], False, workers)
+    found = review(folders[0], outcome)
+    with fresh_folder(out, overwrite=overwrite) as folder:
+        write_review(found, folder, opt.command())
+    print(found["verdict"])
+    print(out / "index.html")
+    finish(outcome.exit_code, out / FILE, folder=str(out))
 
 
 def fit(

@@ -1,4 +1,4 @@
-"""The commands `check`, `audit` and `doctor`."""
+"""The commands `check`, `validate`, `audit` and `doctor`."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from calib.checking.check import Outcome
     from calib.checking.compare import Item
     from calib.he2019.audit import Audit
+    from calib.he2019.tables import PublishedTable
 
 _Quick = Annotated[
     bool, typer.Option("--quick", help="Skip the sampling: hashes, inputs and estimates only.")
@@ -46,7 +47,7 @@ def check(
     Ends with 0 where all is the same, 1 where something differs, 2 where it cannot be checked.
     """
     try:
-        outcome = _checked(folder, quick, workers, effects)
+        outcome = run_check(folder, quick, workers, effects)
     except CalibError as error:
         reason = {"verdict": "cannot be checked", "reason": str(error), "exit_code": 2}
         finish(0, {"folder": str(folder), **reason})
@@ -55,7 +56,8 @@ def check(
     finish(outcome.exit_code, outcome.document())
 
 
-def _checked(folder: Path, quick: bool, workers: int, effects: Path | None = None) -> Outcome:
+def run_check(folder: Path, quick: bool, workers: int, effects: Path | None = None) -> Outcome:
+    """Check a folder with a bar for each kind of work."""
     from calib.batch.pool import pool
     from calib.checking.check import check as check_folder
     from calib.models.simulators.files import load_files
@@ -104,14 +106,9 @@ def _groups(outcome: Outcome) -> Table:
     table.add_column("compared")
     for heading in (*Status, "largest difference\nof what is allowed"):
         table.add_column(str(heading), justify="right")
-    groups: dict[str, list[Item]] = {}
-    for item in outcome.items:
-        groups.setdefault(item.group.partition(" (")[0], []).append(item)
-    for name, items in groups.items():
-        counts = [sum(item.status is status for item in items) for status in Status]
-        largest = max((item.share or 0.0 for item in items), default=0.0)
+    for name, (counts, largest) in outcome.groups.items():
         part = f"{plain_number(100.0 * largest)} %" if largest else ""
-        table.add_row(name, *(str(n) if n else "" for n in counts), part)
+        table.add_row(name, *(str(n) if n else "" for n in counts.values()), part)
     return table
 
 
@@ -140,11 +137,43 @@ def _short(value: Any) -> str:
     return text if len(text) <= 24 else f"{text[:16]}..."
 
 
+def validate(
+    reference: Annotated[Path, typer.Argument(help="Run folder of `calib fit`.")],
+    file: Annotated[Path, typer.Argument(help="CSV of your readings, of another campaign.")],
+    plugins: opt.Models = None,
+    simulator: opt.Simulators = None,
+    json: opt.Json = False,
+) -> None:
+    """Judge whether your readings are consistent with a reference campaign.
+
+    Ends with 0 where they are, 1 where they are not, 2 where no row can be judged, 3 where the
+    reference did not converge.
+    """
+    from calib import consistency, load_calibration
+    from calib.data import read_for_model
+    from calib.report.verdict import kept_verdict
+
+    calibration = load_calibration(reference)
+    model = calibration.problem.bound.model
+    table = read_for_model(file, (*model.conditions, model.output))
+    found, judged = consistency(calibration, table), kept_verdict(reference)
+    doubts = () if judged is None else judged.for_rows(table.columns)
+    for doubt in doubts:
+        announce(f"the reference: {doubt}")
+    print(*found.lines, sep="\n")
+    code = 3 if not found.converged else 1 if found.differs else 0
+    finish(code, found.document(), doubts=list(doubts))
+
+
 def audit(
     ctx: typer.Context,
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", help="Folder for audit.json, audit.csv, figures and a page."),
+    ] = None,
+    number: Annotated[
+        int | None,
+        typer.Option("--table", help="Show this published table, recomputed.", min=1, max=6),
     ] = None,
     json: opt.Json = False,
     seed: opt.Seed = 2019,
@@ -154,6 +183,7 @@ def audit(
     from calib.batch.folders import claimed, fresh_folder
     from calib.he2019.audit import audit_json, run_audit
     from calib.he2019.sections import write_audit_page
+    from calib.he2019.tables import published_table
 
     if out is not None:
         ctx.with_resource(claimed(out, overwrite=overwrite))
@@ -164,10 +194,29 @@ def audit(
             with fresh_folder(out, overwrite=overwrite) as folder:
                 write_audit_page(found, folder, opt.command())
             tell("drawing figures", 1, 1)
-    _print_audit(found)
+    table = None if number is None else published_table(number, found)
+    if table is None:
+        _print_audit(found)
+    else:
+        _print_table(table)
     if out is not None:
         print(out / "index.html")
-    finish(0, loads(audit_json(found)))
+    finish(0, loads(audit_json(found)) if table is None else table.document())
+
+
+def _print_table(found: PublishedTable) -> None:
+    from rich.table import Table
+
+    table = Table(title=f"Table {found.number} of He, Sandu & Osorio (2019), reconstructed data")
+    for heading in found.HEAD:
+        left = heading in ("figure", "judgement")
+        table.add_column(heading, justify="left" if left else "right")
+    for row in found.rows:
+        table.add_row(*row.cells)
+    console = wide_console()
+    console.print(table)
+    for f in found.findings:
+        console.print(f"{f.key}: {f.verdict.value}: {f.evidence}", soft_wrap=True)
 
 
 def _print_audit(found: Audit) -> None:
@@ -229,6 +278,7 @@ def doctor(
     environment = Environment.here().document()
     # By the extra of `pip install terracalib[...]` the package that shows it is there, and its use.
     extras = {
+        "crate": ("rocrate", "`calib export --ro-crate`"),
         "dashboard": ("bokeh", "Dask's page of what the workers do"),
         "docs": ("sphinx", "the documentation of a checkout"),
         "import": ("python-calamine", "workbooks and Parquet for `calib import`"),
@@ -251,7 +301,7 @@ def doctor(
     if folder is None:
         print("  none here: it is in the repository")
     else:
-        outcome = _checked(folder, quick, opt.CORES)
+        outcome = run_check(folder, quick, opt.CORES)
         code = outcome.exit_code
         checked = {"folder": str(folder), "verdict": outcome.verdict, "exit_code": code}
         print(f"  {folder}: {outcome.verdict}")

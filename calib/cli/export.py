@@ -30,8 +30,10 @@ class Wanted(NamedTuple):
 
 
 def export(
-    run: Annotated[Path, typer.Argument(help="Run folder of `calib fit`.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="File to write.")],
+    run: Annotated[
+        Path, typer.Argument(help="Run folder of `calib fit`; with --ro-crate any that checks.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="File (or folder) to write.")],
     form: Annotated[
         str,
         typer.Option(
@@ -56,6 +58,16 @@ def export(
     ] = 0,
     each: Annotated[bool, typer.Option("--each", help="Also write a file of each draw.")] = False,
     overwrite: opt.Overwrite = False,
+    ro_crate: Annotated[
+        bool,
+        typer.Option("--ro-crate", help="Pack it as a research object: a folder, or a .zip file."),
+    ] = False,
+    licence: Annotated[
+        str, typer.Option("--license", help="Licence of the research object, e.g. CC-BY-4.0.")
+    ] = "",
+    author: Annotated[
+        list[str] | None, typer.Option(help="Its author, with an ORCID if any; repeatable.")
+    ] = None,
     plugins: opt.Models = None,
     simulator: opt.Simulators = None,
     json: opt.Json = False,
@@ -64,6 +76,14 @@ def export(
     from calib import load_calibration
     from calib.batch.folders import write_whole, writing
 
+    if ro_crate:
+        from calib.checking.crate import write_crate
+
+        packed = write_crate(run, out, licence=licence, authors=author or (), models=plugins or ())
+        print(f"{len(packed)} files packed; README.md in it says how to compute them again")
+        print(out)
+        finish(0, {"crate": str(out), "files": packed})
+        return
     form = form or out.suffix.removeprefix(".")
     if form not in FORMATS:
         hint = meant(form, FORMATS, "use one of these")

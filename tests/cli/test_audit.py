@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.commands import Calib
+from tests.docs.pages import told as keys_told
 
 
 @pytest.fixture
@@ -52,6 +53,24 @@ def test_a_folder_with_page_json_csv_and_figures(calib: Calib, seeds: list[int])
     refused = calib("audit", "--out", "thesis", "--overwrite")
     assert (refused.code, "was not written by calib" in refused.err) == (2, True)
     assert len(seeds) == before
+
+
+def test_table_4_in_one_command(calib: Calib, seeds: list[int]) -> None:
+    ran = calib("audit", "--table", 4)
+    assert ran.code == 0
+    printed = [line.split("│") for line in ran.out.splitlines() if "Table 4, 42 psi: D" in line]
+    (_, figure, published, again, posterior, judgement, _), *_ = printed
+    assert (figure.strip(), published.strip(), again.strip()) == (
+        "Table 4, 42 psi: D, kN", "0.5954", "0.5954",
+    )  # fmt: skip
+    assert posterior.strip().startswith("0.58")
+    assert judgement.strip() == "same digits; inside the HDI; confirmed (table4_digits)"
+    assert "table4_digits: confirmed: Rounding moves the pull" in ran.out
+    assert "reconstructed data" in ran.err
+    told = json.loads(calib("audit", "--table", 2, "--json").out)
+    assert {*told, *told["rows"][0]} - {"schema", "exit_code"} <= keys_told()
+    assert (told["schema"], told["table"], len(told["rows"])) == ("calib/published-table/1", 2, 7)
+    assert calib("audit", "--table", 7).code == 2
 
 
 @pytest.mark.slow

@@ -154,7 +154,7 @@ def test_what_is_installed_and_whether_a_report_checks(
     def stopped(*_: object, **__: object) -> None:
         raise CalibError("stopped in the middle")
 
-    monkeypatch.setattr("calib.cli.check._checked", stopped)
+    monkeypatch.setattr("calib.cli.check.run_check", stopped)
     told = calib("doctor", "--report", run)
     first, second = told.err.splitlines()
     assert first == (

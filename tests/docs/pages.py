@@ -29,6 +29,13 @@ PAGES = {
 NOTEBOOKS = {
     path.stem: path for path in sorted((DOCS / "gallery").glob("*.md")) if path.stem != "index"
 }
+
+
+def told() -> set[str]:
+    """Return the keys that the page of the files that calib writes names."""
+    return set(re.findall(r"`(\w+)`", (DOCS / "formats" / "results.md").read_text("utf-8")))
+
+
 _FENCE = re.compile(r"^(`{3,}|:{3,})(.*)$")
 _MARK = re.compile(r"^(?:%|<!--)\s*(slow|not run|exit \d)\b")
 

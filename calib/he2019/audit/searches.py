@@ -119,7 +119,7 @@ def study_convergence(
     tell(what, planned, planned)
     table = load_he2019("drawbar_pull")
     read_off = {
-        psi: estimate(_alone(table, psi), "geometric", generator(seed, "audit", "geometric"))
+        psi: estimate(at_pressure(table, psi), "geometric", generator(seed, "audit", "geometric"))
         for psi in texts
     }
     *alone, together = found
@@ -127,7 +127,8 @@ def study_convergence(
     return GeneticStudy(dict(zip(texts, alone, strict=True)), together, in_printed, read_off)
 
 
-def _alone(table: Table, psi: int) -> Problem:
+def at_pressure(table: Table, psi: int) -> Problem:
+    """Return the problem of one pressure by itself, as Tables 3 and 4 fit it."""
     rows = table.take(np.isclose(table["inflation_pressure_psi"], psi))
     return build_problem("magic_formula", rows, fixed={"Sh": 0.0, "Sv": 0.0})
 
@@ -139,7 +140,7 @@ def _repeat(psi: int | None, text: str, seed: int, n: int, settings: GeneticSett
     if psi is None:
         problem, name = build_problem("magic_formula_pressure", table), "all pressures"
     else:
-        problem, name = _alone(table, psi), f"{psi} psi"
+        problem, name = at_pressure(table, psi), f"{psi} psi"
     labels = ("audit", "genetic", "joint" if psi is None else f"{psi}")
     optimum = estimate(problem, "least_squares", generator(seed, *labels, "optimum")).cost
     space = search_space(hold_unidentified(problem)[0])
