@@ -21,6 +21,7 @@ from calib.cli import (
     imports,
     interrupted,
     options,
+    plan,
     prediction,
 )
 from calib.errors import CalibError
@@ -85,6 +86,7 @@ _COMMANDS: Mapping[str, Mapping[Callable[..., None], str]] = {
         imports.import_: "import run7.xlsx --out my.csv",
         calibration.fit: "fit my.csv --model magic_formula_pressure --out run",
         prediction.predict: "predict run --at conditions.csv --out predicted.csv",
+        plan.plan: "plan run --grid conditions.csv --budget 6 --out tests.csv",
         export.export: "export run --at inflation_pressure_psi=30 --out tyre.tir",
         calibration.report: "report my.csv --hold-out inflation_pressure_psi=30 --out report",
         calibration.compare: "compare bekker reece plates.csv --hold-out plate_width_mm=80 "

@@ -54,7 +54,7 @@ def export(
         raise CalibError(f"there is no format {form!r}", expected=", ".join(FORMATS), hint=hint)
     if each and not draws:
         raise CalibError("--each is for draws, and none are asked for", hint="add --draws N")
-    conditions = dict(map(_condition, at or ()))
+    conditions = dict(map(condition, at or ()))
     calibration = load_calibration(run)
     if not calibration.converged:
         announce("this calibration did not converge; it is not to be used")
@@ -74,13 +74,14 @@ def export(
     finish(0 if calibration.converged else 3, {"files": [str(path) for path in files]})
 
 
-def _condition(text: str) -> tuple[str, float]:
+def condition(text: str, option: str = "--at") -> tuple[str, float]:
+    """Read an option such as inflation_pressure_psi=30."""
     column, _, value = text.partition("=")
     try:
         return column.strip(), float(value)
     except ValueError:
         raise CalibError(
-            f"cannot read --at {text!r}",
+            f"cannot read {option} {text!r}",
             expected="COLUMN=VALUE, for instance inflation_pressure_psi=30",
             hint="name a column with its unit, an equals sign and one number",
         ) from None

@@ -18,6 +18,7 @@ from calib.errors import CalibError
 if TYPE_CHECKING:
     from calib.data import Table
     from calib.gap.case import Case
+    from calib.gap.corrected import Corrected
     from calib.inference.emulation import Emulation
 
 
@@ -233,6 +234,18 @@ def predict(
     finish(0 if converged else 3, numbers, outside=outside, doubts=list(doubts))
 
 
+def loaded(run: Path, effects: Path | None) -> Corrected:
+    """Load the corrected model of a diagnosis, with emulators and effects of one's own."""
+    from calib.gap.corrected import load_corrected
+    from calib.gap.effects import EFFECTS
+    from calib.gap.effects.user import load_effects
+    from calib.models.simulators.files import load_files
+
+    load_files(sorted((run / "emulators").glob("*.npz")))
+    own = {} if effects is None else load_effects(effects)
+    return load_corrected(run, {**EFFECTS, **own})
+
+
 def _check_replaceable(out: Path, at: Path, overwrite: bool) -> None:
     """Refuse to replace a file unless it is a prediction, and that is wanted."""
     # The last column tells that a file is a prediction, here of a run that did not converge.
@@ -260,14 +273,9 @@ def _predict_corrected(
     import numpy as np
 
     from calib.data import read_for_model
-    from calib.gap.corrected import check_units_of, covered, load_corrected, predict_columns
-    from calib.gap.effects import EFFECTS
-    from calib.gap.effects.user import load_effects
-    from calib.models.simulators.files import load_files
+    from calib.gap.corrected import check_units_of, covered, predict_columns
 
-    load_files(sorted((run / "emulators").glob("*.npz")))
-    own = {} if effects is None else load_effects(effects)
-    corrected = load_corrected(run, {**EFFECTS, **own})
+    corrected = loaded(run, effects)
     used = {c for o in corrected.data.outputs for c in o.problem.bound.model.conditions}
     table = read_for_model(at, sorted(used))
     check_units_of(corrected, table)
