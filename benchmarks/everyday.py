@@ -159,6 +159,11 @@ class Tree:
                 [*_CALIB, "predict", run, "--at", pulls, "--overwrite",
                  "--out", f"{self.scratch}/predicted.csv"],
             ),
+            "calib plan, 6 tests of 1,000 candidates": Command(
+                [*_CALIB, "plan", run, "--grid", _grid(self.scratch), "--budget", "6"],
+                asked=20.0, by="processor",
+                ends=(0,) if (self.root / "calib" / "cli" / "plan.py").is_file() else (2,),
+            ),
         }  # fmt: skip
         if tests:
             if find_spec("xdist") is None:
@@ -190,6 +195,14 @@ def _log(folder: Path) -> list[str]:
     np.savetxt(path, table, "%.4f", ",", header=",".join(columns))
     path.with_suffix(".toml").write_text(f'[columns]\n{mapping}[thin]\nevery = "auto"\n')
     return [str(path), "--mapping", str(path.with_suffix(".toml"))]
+
+
+def _grid(folder: Path) -> str:
+    """Write the conditions of a thousand possible tests."""
+    rows = [f"{0.6 * i},{18 + 24 * j / 9}" for i in range(1, 101) for j in range(10)]
+    path = folder / "possible.csv"
+    path.write_text("\n".join(["slip_percent,inflation_pressure_psi", *rows]) + "\n")
+    return str(path)
 
 
 _MEASURED = ("clock", "processor", "exit_codes")

@@ -22,7 +22,7 @@ def plan(
     run: Annotated[Path, typer.Argument(help="Folder of `calib fit` or `calib diagnose`.")],
     grid: Annotated[
         Path,
-        typer.Option(help="CSV with the conditions of possible tests, and their cost if it differs."),
+        typer.Option(help="CSV with conditions of possible tests, and their cost if it differs."),
     ],
     budget: Annotated[float, typer.Option(help="What all tests may cost; by default 1 each.")],
     at: Annotated[
@@ -127,7 +127,9 @@ def lines(chosen: NextTests, columns: Mapping[str, Any]) -> Iterator[str]:
         yield f"{MOST_TESTS} tests do not halve the band: they leave {percent(chosen.left)}."
     found: dict[str, Sequence[Any]] = {"test": range(1, n + 1), **columns}
     found |= {f"{name} %": [f"{100.0 * v:.1f}" for v in forecast[name][1:]] for name in forecast}
-    found["outside the calibrated range"] = [", ".join(flags) for flags in chosen.outside]
+    found["outside the calibrated range"] = [
+        ", ".join(map(chosen.table.header_of, row)) for row in chosen.outside
+    ]
     if not any(chosen.outside):
         found.popitem()
     yield from aligned(
