@@ -37,7 +37,9 @@ def test_a_plan_is_printed_and_written_to_be_filled_in(calib: Calib, run: Path) 
 def test_every_key_of_its_json_is_told(calib: Calib, run: Path) -> None:
     Path("grid.csv").write_text(GRID)
     Path("at.csv").write_text("slip_percent,average_ground_pressure_psi\n10,18\n")
-    words = ("--budget", 2, "--at", "at.csv", "--exceeds", "rut_depth_mm=20", "--json")
+    median = json.loads(calib("predict", "run", "--at", "at.csv", "--json").out)["columns"]
+    level = f"rut_depth_mm={median['rut_depth_mm_median'][0]}"
+    words = ("--budget", 2, "--at", "at.csv", "--exceeds", level, "--json")
     ran = calib("plan", "run", "--grid", "grid.csv", *words)
     assert ran.code == 0, ran.err
     found = json.loads(ran.out)
