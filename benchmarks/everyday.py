@@ -169,6 +169,11 @@ class Tree:
                 [*_CALIB, "predict", run, "--at", pulls, "--overwrite",
                  "--out", f"{self.scratch}/predicted.csv"],
             ),
+            "calib plan, 6 tests of 1,000 candidates": Command(
+                [*_CALIB, "plan", run, "--grid", _grid(self.scratch), "--budget", "6"],
+                asked=20.0, by="processor",
+                ends=(0,) if (self.root / "calib" / "cli" / "plan.py").is_file() else (2,),
+            ),
         }  # fmt: skip
         if tests:
             if find_spec("xdist") is None:
@@ -244,6 +249,14 @@ def _groups(folder: Path) -> str:
             lines.append(f"{p:.6g},{depth:.6g},bin {i + 1}")
     path = folder / "groups.csv"
     path.write_text("\n".join(lines) + "\n")
+    return str(path)
+
+
+def _grid(folder: Path) -> str:
+    """Write the conditions of a thousand possible tests."""
+    rows = [f"{0.6 * i},{18 + 24 * j / 9}" for i in range(1, 101) for j in range(10)]
+    path = folder / "possible.csv"
+    path.write_text("\n".join(["slip_percent,inflation_pressure_psi", *rows]) + "\n")
     return str(path)
 
 

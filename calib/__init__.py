@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from calib.gap.case import Case, read_case
     from calib.gap.diagnose import Diagnosis, diagnose
     from calib.gap.effects import Effect
+    from calib.gap.plan import plan_tests
     from calib.gap.predict import predict
     from calib.he2019.audit import Audit, run_audit
     from calib.he2019.embedded import load_he2019
@@ -51,6 +52,7 @@ _HOME = {
     "calib.gap.case": "Case read_case",
     "calib.gap.diagnose": "Diagnosis diagnose",
     "calib.gap.effects": "Effect",
+    "calib.gap.plan": "plan_tests",
     "calib.gap.predict": "predict",
     "calib.he2019.audit": "Audit run_audit",
     "calib.he2019.embedded": "load_he2019",
@@ -112,6 +114,7 @@ __all__ = [
     "leave_one_out",
     "load_calibration",
     "load_he2019",
+    "plan_tests",
     "predict",
     "read_case",
     "read_log",
@@ -160,6 +163,7 @@ _UNLISTED = [
     "Verdict",
     "consistency",
     "estimate",
+    "plan_tests",
     "read_plan",
     "read_tir",
     "run_audit",

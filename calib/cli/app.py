@@ -22,6 +22,7 @@ from calib.cli import (
     interrupted,
     joint,
     options,
+    plan,
     prediction,
 )
 from calib.errors import CalibError
@@ -87,6 +88,7 @@ _COMMANDS: Mapping[str, Mapping[Callable[..., None], str]] = {
         calibration.fit: "fit my.csv --model magic_formula_pressure --out run",
         joint.joint: "joint plates.csv --model bekker --group bin --pool z_ref --out bins",
         prediction.predict: "predict run --at conditions.csv --out predicted.csv",
+        plan.plan: "plan run --grid conditions.csv --budget 6 --out tests.csv",
         export.export: "export run --at inflation_pressure_psi=30 --out tyre.tir",
         calibration.report: "report my.csv --hold-out inflation_pressure_psi=30 --out report",
         calibration.compare: "compare bekker reece plates.csv --hold-out plate_width_mm=80 "

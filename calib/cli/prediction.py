@@ -19,6 +19,7 @@ from calib.errors import CalibError
 if TYPE_CHECKING:
     from calib.data import Table
     from calib.gap.case import Case
+    from calib.gap.corrected import Corrected
     from calib.inference.calibration import Calibration
     from calib.inference.emulation import Emulation
 
@@ -309,6 +310,18 @@ def _predict_joint(
     finish(0 if found.converged else 3, numbers, outside=outside)
 
 
+def loaded(run: Path, effects: Path | None) -> Corrected:
+    """Load the corrected model of a diagnosis, with emulators and effects of one's own."""
+    from calib.gap.corrected import load_corrected
+    from calib.gap.effects import EFFECTS
+    from calib.gap.effects.user import load_effects
+    from calib.models.simulators.files import load_files
+
+    load_files(sorted((run / "emulators").glob("*.npz")))
+    own = {} if effects is None else load_effects(effects)
+    return load_corrected(run, {**EFFECTS, **own})
+
+
 def _check_replaceable(out: Path, at: Path, overwrite: bool, last: tuple[str, ...]) -> None:
     """Refuse to replace a file unless it is a prediction, and that is wanted.
 
@@ -339,14 +352,9 @@ def _predict_corrected(
 
     from calib.data import read_for_model
     from calib.data.quantities import OUTPUTS
-    from calib.gap.corrected import check_units_of, covered, load_corrected, predict_corrected
-    from calib.gap.effects import EFFECTS
-    from calib.gap.effects.user import load_effects
-    from calib.models.simulators.files import load_files
+    from calib.gap.corrected import check_units_of, covered, predict_corrected
 
-    load_files(sorted((run / "emulators").glob("*.npz")))
-    own = {} if effects is None else load_effects(effects)
-    corrected = load_corrected(run, {**EFFECTS, **own})
+    corrected = loaded(run, effects)
     used = sorted({c for o in corrected.data.outputs for c in o.problem.bound.model.conditions})
     read = read_for_model(at, used)
     check_units_of(corrected, read)

@@ -301,6 +301,32 @@ def covered(corrected: Corrected, table: Table) -> dict[str, Array]:
     }
 
 
+def all_conditions(corrected: Corrected, table: Table) -> tuple[Table, dict[str, Array]]:
+    """Return new conditions with the declared columns, and their values, the order's too.
+
+    Raises
+    ------
+    CalibError
+        If a condition is missing.
+    """
+    table = with_declared(table, corrected.data.case.covariates)
+    needed = corrected.data.view.conditions
+    order = corrected.data.view.column("order")
+    missing = [n for n in needed if n not in table and n not in (*OUTPUTS.values(), order)]
+    if missing:
+        raise CalibError(
+            f"the corrected model needs {', '.join(missing)}",
+            where=table.source,
+            expected="the conditions and covariates of the field campaign",
+            hint="add the columns",
+        )
+    conditions = dict(table.columns)
+    if order is not None and order not in conditions:
+        # A drift is taken as it stood at the end of the campaign.
+        conditions[order] = np.full(len(table), corrected.data.view.order_range[1])
+    return table, conditions
+
+
 def predict_columns(
     corrected: Corrected, table: Table, left_out: Collection[str] = ()
 ) -> dict[str, Array | list[str]]:
@@ -345,21 +371,7 @@ def _truth(
             expected=", ".join(corrected.causes) or "none: it has no cause",
             hint=meant(unknown[0], corrected.causes, "name one of these, or leave nothing out"),
         )
-    table = with_declared(table, corrected.data.case.covariates)
-    needed = corrected.data.view.conditions
-    order = corrected.data.view.column("order")
-    missing = [n for n in needed if n not in table and n not in (*OUTPUTS.values(), order)]
-    if missing:
-        raise CalibError(
-            f"the corrected model needs {', '.join(missing)}",
-            where=table.source,
-            expected="the conditions and covariates of the field campaign",
-            hint="add the columns",
-        )
-    conditions = dict(table.columns)
-    if order is not None and order not in conditions:
-        # A drift is predicted as it stood at the end of the campaign.
-        conditions[order] = np.full(len(table), corrected.data.view.order_range[1])
+    table, conditions = all_conditions(corrected, table)
     at = corrected.data.at_conditions(conditions)
     return table, conditions, corrected.mixture.at(at, left_out=left_out)
 

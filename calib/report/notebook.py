@@ -28,6 +28,7 @@ from calib.report.labels import axis_of, parameter_unit, units_of
 from calib.report.rows import Fitted
 from calib.report.verdict import verdict
 from calib.validation.comparison import Comparison
+from calib.validation.plan import NextTests
 from calib.validation.prediction import Prediction, band_columns, predictive_draws
 from calib.validation.validate import Validation
 
@@ -116,6 +117,13 @@ def _(found: Diagnosis) -> pd.DataFrame:
         for name, cause in causes.items()
     }
     return pd.DataFrame.from_dict(rows, orient="index").rename_axis("cause")
+
+
+@frame.register
+def _(found: NextTests) -> pd.DataFrame:
+    after = {f"{name}_after": values[1:] for name, values in found.forecast.items()}
+    flags = {"outside_calibrated_range": ["+".join(row) for row in found.outside]}
+    return pd.DataFrame({**found.table.columns, "cost": found.cost, **after, **flags})
 
 
 @singledispatch

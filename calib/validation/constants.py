@@ -35,3 +35,6 @@ FAR_SDS = 3.0
 # Rows that are judged at all, and rows of a group whose scatter or mean is compared, at least;
 # test_assumptions.
 FEWEST, FEWEST_IN_GROUP = 8, 5
+# Half of a normal's central 90 % in sds; tests of a plan, or until a band halves: nobody plans
+# more; test_plan.
+HALF_BAND, MOST_TESTS = 1.6448536269514722, 50
