@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -239,3 +240,34 @@ def test_simulation_based_calibration_of_groups() -> None:
         ranks.append([np.mean(found.parameters[n] < v) for n, v in truth.items()])
     for column in np.array(ranks).T:
         assert stats.kstest(column, "uniform").pvalue > 0.01
+
+
+@pytest.mark.slow
+def test_wheel_and_plates_of_one_sand() -> None:
+    """A rigid wheel and plates on the sand of Carnegie Mellon University, a third held out.
+
+    Plates narrow the sinkage of the wheel; held-out readings are covered as by separate fits.
+    """
+    data = Path(__file__).parents[2] / "challenge" / "measured" / "data"
+    wheel = pd.read_csv(data / "cmu_wheel.csv").query("series == 'smooth_0' and slip_ratio >= 0")
+    wheel = wheel.drop(columns="series").sort_values("slip_ratio").reset_index(drop=True)
+    plates = pd.read_csv(data / "cmu_plate.csv").query("series.str.startswith('large')")
+    plates = plates.drop(columns="series")
+    narrower, covered = [], np.zeros(2)
+    for fold in range(3):
+        held, rest = wheel[wheel.index % 3 == fold], wheel[wheel.index % 3 != fold]
+        models = {"wong_reece_pull": rest, "wong_reece_sinkage": rest, "reece_plate": plates}
+        found = calibrate_joint(build_joint(models), seed=1)
+        for model, output in (
+            ("wong_reece_pull", "drawbar_pull"), ("wong_reece_sinkage", "wong_reece_sinkage")
+        ):  # fmt: skip
+            alone = calib.calibrate(calib.build_problem(model, rest, others=len(rest)), seed=1)
+            widths = []
+            for i, one in enumerate((alone, found.calibration(output))):
+                assert one.converged
+                covered[i] += calib.validate_held_out(one, held).scores.coverage[0.9].hits
+                bands = calib.predict(one, held).parameter
+                widths.append(float(np.mean(bands.upper[0.9] - bands.lower[0.9])))
+            narrower += [widths[1] / widths[0]] if model == "wong_reece_sinkage" else []
+    assert max(narrower) < 1.0
+    assert covered.min() >= 21  # of 24; at 90 %, 19 to 24 have a probability of 0.98
