@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from numbers import Real
 
 import numpy as np
@@ -22,7 +22,7 @@ from calib.gap.mixture import Mixture
 from calib.gap.noise import noise_conditions
 from calib.inference.calibration import Calibration
 from calib.inference.random import generator
-from calib.validation.constants import HALF_BAND
+from calib.validation.constants import HALF_BAND, MOST_TESTS
 from calib.validation.plan import (
     MOMENTS,
     WEIGHTED,
@@ -62,8 +62,8 @@ def plan_tests(
         conditions to predict is to be decided.
     aim : {"bands", "causes", "decision"}, optional
         Narrow the band of the mean: its expected variance, within explanations of a diagnosis and
-        between them. Separate the explanations: their expected entropy. Decide: the expected
-        probability of a wrong decision. The last is the default with `exceeds`, else the first.
+        between them. Separate the explanations: the expected probability of wrong ones. Decide:
+        that of a wrong decision. The last is the default with `exceeds`, else the first.
 
     Returns
     -------
@@ -94,21 +94,33 @@ def plan_tests(
         )  # fmt: skip
     tests = as_table(grid)
     wanted = tests if at is None else as_table(at)
-    if len(tests) > MAX_TEXT_ROWS:
-        raise CalibError(
-            f"{len(tests)} possible tests", where=tests.source, expected=f"at most {MAX_TEXT_ROWS}",
-            hint="thin the grid",
-        )  # fmt: skip
+    # Between explanations a decision is worked out condition by condition.
+    few = aim == "decision" and not isinstance(found, Calibration)
+    for table, most in ((tests, MAX_TEXT_ROWS), (wanted, MOST_TESTS if few else MAX_TEXT_ROWS)):
+        if len(table) > most:
+            raise CalibError(
+                f"{len(table)} conditions", where=table.source, expected=f"at most {most}",
+                hint="list the conditions of the decision (at)" if few else "thin them",
+            )  # fmt: skip
     if isinstance(found, Calibration):
-        return _of_calibration(found, tests, wanted, budget, aim, exceeds)
-    corrected = found.corrected if isinstance(found, Diagnosis) else found
-    return _of_diagnosis(corrected, tests, wanted, budget, aim, exceeds)
+        of = _of_calibration(found, tests, wanted)
+    else:
+        of = _of_diagnosis(
+            found if isinstance(found, Corrected) else found.corrected, tests, wanted
+        )
+    make, tests, names, flags, rng = of
+    return chosen_tests(make, tests, budget, aim, _threshold(exceeds, names), names, flags, rng)
 
 
-def _of_calibration(
-    found: Calibration, tests: Table, wanted: Table, budget: float, aim: Aim,
-    exceeds: Mapping[str, float] | None,
-) -> NextTests:  # fmt: skip
+# Beliefs about some rows of the tests, the tests, outputs, what leaves the calibrated range, and
+# random numbers.
+type _Of = tuple[
+    Callable[[NDArray[np.intp] | None], Beliefs], Table, tuple[str, ...],
+    tuple[tuple[str, ...], ...], np.random.Generator,
+]  # fmt: skip
+
+
+def _of_calibration(found: Calibration, tests: Table, wanted: Table) -> _Of:
     model, known = found.problem.bound.model, found.problem.conditions
     at, to = (model.select(table.columns) for table in (tests, wanted))
     for table in (tests, wanted):
@@ -119,15 +131,10 @@ def _of_calibration(
         some = at if rows is None else {name: v[rows] for name, v in at.items()}
         return beliefs_of(found, some, to, rng, MOMENTS if rows is None else WEIGHTED)
 
-    over = _threshold(exceeds, (model.output,))
-    flags = outside(known, at)
-    return chosen_tests(make, tests, budget, aim, over, (model.output,), flags, rng)
+    return make, tests, (model.output,), outside(known, at), rng
 
 
-def _of_diagnosis(
-    found: Corrected, tests: Table, wanted: Table, budget: float, aim: Aim,
-    exceeds: Mapping[str, float] | None,
-) -> NextTests:  # fmt: skip
+def _of_diagnosis(found: Corrected, tests: Table, wanted: Table) -> _Of:
     for table in (tests, wanted):
         check_units_of(found, table)
     data, (tests, at), (_, to) = found.data, *(all_conditions(found, t) for t in (tests, wanted))
@@ -138,10 +145,10 @@ def _of_diagnosis(
         both = {name: np.concatenate([at[name][some], to[name]]) for name in used}
         return _beliefs(found.mixture, data.at_conditions(both), some.size)
 
-    names, known = tuple(OUTPUTS[o] for o in data.names), covered(found, tests)
+    known = covered(found, tests)
     flags = outside(known, {n: tests[n] for n in known}) if known else ((),) * len(tests)
     rng = generator(found.mixture.seed, "gap", "plan")
-    return chosen_tests(make, tests, budget, aim, _threshold(exceeds, names), names, flags, rng)
+    return make, tests, tuple(OUTPUTS[o] for o in data.names), flags, rng
 
 
 def _threshold(
@@ -164,19 +171,19 @@ def _beliefs(mixed: Mixture, view: View, m: int) -> Beliefs:
     outputs, at = mixed.data.outputs, noise_conditions(view)
     names = list(dict.fromkeys(fit.forward.hypothesis.name for fit in mixed.fits))
     parts = []
-    half = np.zeros((len(outputs), at.slip.size - m))
     for fit, probability in zip(mixed.fits, mixed.probability, strict=True):
         n, mean = len(fit.sample), fit.forward.field(fit.sample, view)
         sd = np.stack([fit.noise[o.name].sd(at) for o in outputs])
         read = np.stack([mean[o.name][:, :m] for o in outputs], axis=-1)
         wanted = np.stack([o.problem.bound.from_response(mean[o.name][:, m:]) for o in outputs], 1)
+        half = HALF_BAND * sd[:, m:] * np.ones_like(wanted)
         for i, o in enumerate(outputs):
-            log = o.problem.bound.model.response == "log"
-            size = np.nanmean(wanted[:, i], axis=0) if log else 1.0
-            half[i] += probability * HALF_BAND * sd[i, m:] * size
+            if o.problem.bound.model.response == "log":
+                half[:, i] *= wanted[:, i]
         cause = np.full(n, names.index(fit.forward.hypothesis.name))
         scale = np.broadcast_to(sd[:, :m].T, read.shape)
-        parts.append((cause, np.full(n, probability / n), read, scale, wanted))
-    cause, weight, read, scale, wanted = map(np.concatenate, zip(*parts, strict=True))
+        parts.append((cause, np.full(n, probability / n), read, scale, wanted, half))
+    cause, *rest = map(np.concatenate, zip(*parts, strict=True))
+    weight, read, scale, wanted, half = rest
     own = np.ones((weight.size, 1))
     return Beliefs(tuple(names), cause, weight, read, scale, wanted, half, own)

@@ -30,7 +30,6 @@ from calib.shown import Shown
 from calib.validation.constants import HALF_BAND, MIN_DEFINED, MOST_TESTS, PARETO_K_MAX
 
 type Aim = Literal["bands", "causes", "decision"]
-AIMS: tuple[Aim, ...] = ("bands", "causes", "decision")
 TRUTHS, SIMULATED = 256, 400  # while tests are chosen, and for the check
 MOMENTS, WEIGHTED = 1000, 4000  # draws of a calibration: for moments, and to be weighted
 _CELLS = 2_000_000
@@ -50,7 +49,7 @@ class Beliefs:
         Mean of a reading and scale of its noise, on the scale of the response.
     targets : ndarray, shape (N, o, t)
         Mean outputs, in their units.
-    half : ndarray, shape (o, t)
+    half : ndarray, shape (N, o, t)
         Half of the 90 % band of the noise there.
     own, noise : ndarray, shape (N, p), and Noise
         The noise at scale one: natural parameters and family.
@@ -76,10 +75,15 @@ class Beliefs:
         """Keep some tests and targets, and the draws that have a value at all of them."""
         readings, wanted = self.readings[:, tests], self.targets[..., targets]
         rows = np.isfinite(readings).all(axis=(1, 2)) & np.isfinite(wanted).all(axis=(1, 2))
+        if (left := self.weight[rows].sum() / self.weight.sum()) < 0.5:
+            raise CalibError(
+                f"the model has a value at all conditions for {left:.0%} of the posterior",
+                expected="most of it", hint="leave out conditions far from the calibrated ones",
+            )  # fmt: skip
         return replace(
             self, cause=self.cause[rows], weight=self.weight[rows] / self.weight[rows].sum(),
             readings=readings[rows], scale=self.scale[:, tests][rows], targets=wanted[rows],
-            half=self.half[:, targets], own=self.own[rows],
+            half=self.half[..., targets][rows], own=self.own[rows],
         )  # fmt: skip
 
     def spread(self) -> tuple[Array, Array]:
@@ -110,15 +114,13 @@ def beliefs_of(
     location = problem.draw_mean_response(natural, both, rng)
     n, m = len(natural), next(iter(tests.values())).size
     wanted = problem.bound.from_response(location[:, m:])
-    half = noise.of_normal(natural, targets, np.full((1, 1), HALF_BAND)).mean(axis=0)
-    if problem.bound.model.response == "log":
-        half = half * np.nanmean(wanted, axis=0)
+    half = noise.of_normal(natural, targets, np.full((1, 1), HALF_BAND))
+    half = half * (wanted if problem.bound.model.response == "log" else np.ones_like(wanted))
     own = [noise.own("nu", natural)] if noise.student else []
     scale = np.broadcast_to(noise.scale(natural, tests), (n, m))[..., None]
     return Beliefs(
         (calibration.label,), np.zeros(n, dtype=np.intp), np.ones(n), location[:, :m, None], scale,
-        wanted[:, None], np.broadcast_to(half, (1, wanted.shape[1])),
-        np.hstack([*own, np.ones((n, 1))]), Noise(noise.family),
+        wanted[:, None], half[:, None], np.hstack([*own, np.ones((n, 1))]), Noise(noise.family),
     )  # fmt: skip
 
 
@@ -177,9 +179,9 @@ class _State:
     def now(self) -> dict[Aim, float]:
         """Return all losses as they are; that of a decision if there is one."""
         weight, mean = softmax(self.ln_w, axis=1)[..., None], self.mean[..., None]
-        asked = dict(zip(AIMS, (True, self.several, self.mean.shape[2] > self.r), strict=True))
-        var = self.var[..., None]
-        return {a: float(self._loss(a, weight, mean, var)[0]) for a in AIMS if asked[a]}
+        asked: dict[Aim, bool] = {"bands": True, "causes": self.several}
+        asked["decision"], var = self.mean.shape[2] > self.r, self.var[..., None]
+        return {a: float(self._loss(a, weight, mean, var)[0]) for a in asked if asked[a]}
 
     def losses(self, tests: NDArray[np.intp]) -> Array:
         """Return what each of some tests is expected to leave of the aim's loss, shape (c,)."""
@@ -360,7 +362,7 @@ def chosen_tests(
     return NextTests(
         grid.take(rows), aim, every[rows], tuple(flags[i] for i in rows), whole.names, outputs,
         tuple((2.0 * HALF_BAND * beliefs.spread()[1][:, 0]).tolist()),
-        tuple((2.0 * np.sqrt(np.square(beliefs.half).mean(axis=1))).tolist()),
+        tuple((2.0 * np.sqrt(beliefs.weight @ np.square(beliefs.half).mean(axis=2))).tolist()),
         forecast, simulated, unreliable, halves[0] if halves and aim == "bands" else None,
         float(np.sqrt(losses[-1])), (int((~tests).sum()), targets.size - used), used,
     )  # fmt: skip

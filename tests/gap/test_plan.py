@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from calib.data import as_table
 from calib.errors import CalibError
 from calib.gap.campaigns import campaigns
-from calib.gap.corrected import Corrected
+from calib.gap.corrected import Corrected, predict_columns
 from calib.gap.effects import EFFECTS
 from calib.gap.fit import Fit
 from calib.gap.forward import Forward
@@ -77,3 +78,19 @@ def test_of_one_explanation_no_causes_are_separated(two: Corrected) -> None:
         plan_tests(Corrected(alone, two.lab_mode), GRID, 1, aim="causes")
     with pytest.raises(CalibError, match="needs inflation_pressure_psi"):
         plan_tests(two, {n: v for n, v in GRID.items() if n != "inflation_pressure_psi"}, 1)
+    many = {n: np.resize(v, 51) for n, v in GRID.items()}
+    with pytest.raises(CalibError, match="51 conditions"):
+        plan_tests(two, many, 1, exceeds={"rut_depth_mm": 25.0})
+
+
+def test_a_limit_that_only_one_explanation_keeps_is_decided_where_they_differ(
+    two: Corrected,
+) -> None:
+    at = {name: values[2:3] for name, values in GRID.items()}
+    (level,) = predict_columns(two, as_table(at))["rut_depth_mm_after"]
+    decided = plan_tests(two, GRID, 1, at, exceeds={"rut_depth_cm": 0.1 * level})
+    assert decided.table["speed_m_s"].tolist() == [2.0]
+    now, then = decided.forecast["decision"]
+    assert then < 0.8 * now
+    value, error = decided.simulated["decision"]
+    assert abs(value - then) < 6.0 * error

@@ -34,7 +34,7 @@ def parabola(draws: int, sigma: np.ndarray = EVEN) -> Beliefs:
     return Beliefs(
         ("line",), np.zeros(draws, dtype=np.intp), np.ones(draws), (b @ terms(SLIPS).T)[..., None],
         np.broadcast_to(sigma, (draws, SLIPS.size))[..., None], (b @ terms(TARGETS).T)[:, None],
-        np.full((1, TARGETS.size), 1.6449 * SIGMA), np.ones((draws, 1)),
+        np.full((draws, 1, TARGETS.size), 1.6449 * SIGMA), np.ones((draws, 1)),
     )  # fmt: skip
 
 
@@ -79,6 +79,7 @@ def test_a_plan_of_a_linear_model_is_that_of_the_closed_form(sigma: np.ndarray) 
     t = terms(TARGETS)
     width = 2 * stats.norm.ppf(0.95) * np.sqrt(np.trace(t @ COVARIANCE @ t.T) / TARGETS.size)
     np.testing.assert_allclose(found.band, [width], rtol=1e-9)
+    np.testing.assert_allclose(found.reading, [2 * 1.6449 * SIGMA], rtol=1e-9)
 
 
 def test_the_best_of_all_plans_is_hardly_better() -> None:
@@ -187,7 +188,7 @@ def two_causes(draws: int, apart: float) -> Beliefs:
     scale = np.where(cause, 0.9, 0.5)[:, None, None] * np.ones_like(read)
     return Beliefs(
         ("one", "other"), cause, np.repeat([0.7, 0.3], half) / half, read, scale,
-        target[:, None, None], np.full((1, 1), 0.8), np.ones((draws, 1)),
+        target[:, None, None], np.full((draws, 1, 1), 0.8), np.ones((draws, 1)),
     )  # fmt: skip
 
 
@@ -225,12 +226,27 @@ def test_two_outputs_are_read_at_once() -> None:
     both = replace(
         one, readings=np.concatenate([one.readings[:, :3], one.readings[:, 3:]], axis=2),
         scale=np.full((500, 3, 2), SIGMA), targets=np.repeat(one.targets, 2, axis=1),
-        half=np.repeat(one.half, 2, axis=0),
+        half=np.repeat(one.half, 2, axis=1),
     )  # fmt: skip
     found = planned(both, 1.0)
     best = min(range(3), key=lambda i: left([i, i + 3]))
     assert rows_of(found, 3) == [best]
     np.testing.assert_allclose(found.forecast["bands"][-1] ** 2, left([best, best + 3]), rtol=1e-6)
+
+
+def test_where_the_model_has_no_value_nothing_is_planned() -> None:
+    base = parabola(500)
+    read = base.readings.copy()
+    read[:50, 0] = np.nan
+    read[:10, 1] = np.nan
+    found = planned(replace(base, readings=read))
+    assert found.excluded == (1, 0)
+    assert 0 not in rows_of(found)
+    with pytest.raises(CalibError, match="no value at any of the conditions"):
+        planned(replace(base, readings=np.full_like(read, np.nan)))
+    scattered = np.where(np.arange(500)[:, None] % 25 == np.arange(20), np.nan, 1.0)[..., None]
+    with pytest.raises(CalibError, match="for 20% of the posterior"):
+        planned(replace(base, readings=scattered, scale=np.ones_like(scattered)))
 
 
 def grid_of(slip: np.ndarray, **more: object) -> dict[str, object]:
