@@ -535,7 +535,7 @@ class JointCalibration:
 
     @cached_property
     def summary(self) -> Mapping[str, ParameterSummary]:
-        """Of every parameter: shared and separate ones, sds between groups, groups' values."""
+        """Summaries of all parameters by name, sds between groups and groups' values among them."""
         units = {p.name: p.unit for p in self.problem.priors.free}
         units |= {f"{p}[{g}]": units[p] for p in self.problem.pooled for g in self.problem.groups}
         ratios = sd_ratios(self.problem.priors, self._split[0])
@@ -594,7 +594,7 @@ class JointCalibration:
 
     @property
     def outputs(self) -> Mapping[str, Calibration]:
-        """What the posterior says of each output: of a new group, where there are groups."""
+        """A calibration of each output by name; of a new group, where there are groups."""
         return {output: self.calibration(output) for output in self.problem.outputs}
 
     def _new(self, h: Array) -> Array:
