@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -26,6 +26,9 @@ from calib.gap.noise import (
     noise_conditions,
     noise_conditions_of_lab,
 )
+from calib.inference.condition_errors import ConditionError
+from calib.inference.likelihood import noise_of
+from calib.inference.mode import find_mode
 from calib.inference.priors import Priors
 from calib.inference.problem import Problem, build_problem
 from calib.models import MODELS, get_model
@@ -195,6 +198,48 @@ def _misfit_ranges(o: OutputData) -> tuple[tuple[str, float, float], ...]:
 
 
 @dataclass(frozen=True)
+class WithErrors:
+    """What errors of conditions do to one output's rows: the lab's, then the field's.
+
+    Parameters
+    ----------
+    of_field : tuple of ConditionError
+    expected : mapping of str to ndarray
+        Conditions of all field rows that have an error, as they are expected.
+    shift : ndarray, shape (n,)
+        Mean response less that at the expected conditions.
+    added : ndarray, shape (n,)
+        What they add to the variance of the noise, in units of it.
+    """
+
+    of_field: tuple[ConditionError, ...]
+    expected: Mapping[str, Array]
+    shift: Array
+    added: Array
+
+    @classmethod
+    def of(cls, problem: Problem, field: Table, rows: NDArray[np.int64]) -> WithErrors | None:
+        """Work it out where the laboratory's fit has its mode; None where nothing has an error."""
+        noise, bound = problem.noise, problem.bound
+        there = noise_of(noise, bound.model, field, problem.priors.source).errors
+        if not (noise.errors or there):
+            return None
+        in_field = replace(problem, table=field, noise=replace(noise, errors=there))
+        natural = problem.theta(find_mode(problem.log_prob, problem.priors)[None])
+        theta, every = problem.of_model(natural), np.arange(len(problem.table))
+        shifts, added = [], []
+        for part, some in ((problem, every), (in_field, rows)):
+            mean, variance = np.zeros((2, some.size))
+            if part.readings is not None:
+                mean, variance = (m[0, some] for m in part.readings.moments(theta)[:2])
+                mean = mean - bound.mean_response(theta, part.conditions)[0, some]
+            shifts.append(mean)
+            added.append(variance / natural[0, -1] ** 2)
+        expected = {e.name: in_field.conditions[e.name] for e in there}
+        return cls(there, expected, np.concatenate(shifts), np.concatenate(added))
+
+
+@dataclass(frozen=True)
 class OutputData:
     """One modelled output: the simulator's problem on the lab rows, and the field rows.
 
@@ -210,6 +255,8 @@ class OutputData:
         Field rows that have the output.
     field : ndarray
         Their outputs on the scale of the response.
+    errors : WithErrors, optional
+        If conditions of either campaign are known with an error.
     along : Along, optional
         If the noise is correlated along runs.
     """
@@ -220,6 +267,7 @@ class OutputData:
     rows: NDArray[np.int64]
     field: Array
     along: Along | None = None
+    errors: WithErrors | None = None
 
     @cached_property
     def role(self) -> str:
@@ -229,8 +277,7 @@ class OutputData:
     def lab_residuals(self, mode: Array) -> Array:
         """Return the residuals of the laboratory's fit at a vector of its priors, shape (n,)."""
         natural = self.priors.to_natural(mode[None])
-        predicted = self.problem.bound.mean_response(natural, self.problem.conditions)[0]
-        return np.asarray(self.problem.response - predicted)
+        return np.asarray(self.problem.residuals(natural)[0])
 
 
 @dataclass(frozen=True)
@@ -299,7 +346,11 @@ class Campaigns:
         """What the noise of every output's lab rows, then field rows, depends on."""
         field = noise_conditions(self.view)
         return {
-            o.name: replace(self.lab_at[o.name] + field.rows(o.rows), along=o.along)
+            o.name: replace(
+                self.lab_at[o.name] + field.rows(o.rows),
+                along=o.along,
+                added=None if o.errors is None else o.errors.added,
+            )
             for o in self.outputs
         }
 
@@ -312,7 +363,33 @@ class Campaigns:
     @cached_property
     def observed(self) -> Array:
         """Lab rows, then field rows, of one output after the other, on the responses' scales."""
-        return np.concatenate([v for o in self.outputs for v in (o.problem.response, o.field)])
+        both = [np.append(o.problem.response, o.field) for o in self.outputs]
+        shifts = (0.0 if o.errors is None else o.errors.shift for o in self.outputs)
+        return np.concatenate([v - shift for v, shift in zip(both, shifts, strict=True)])
+
+    @cached_property
+    def _errors(self) -> list[tuple[Table, ConditionError]]:
+        """Errors of conditions, each with the campaign."""
+        case = self.case
+        found = [(case.lab, e) for o in self.outputs for e in o.problem.noise.errors]
+        there = [o.errors.of_field for o in self.outputs if o.errors is not None]
+        return found + [(case.field, e) for errors in there for e in errors]
+
+    @property
+    def error_columns(self) -> set[str]:
+        """Columns that errors of conditions are in."""
+        return {error.sd for _, error in self._errors if isinstance(error.sd, str)}
+
+    @property
+    def said_of_errors(self) -> list[str]:
+        """Say what is allowed for as errors of conditions, of either campaign."""
+        found = [f"{table.source}: {error.words()}" for table, error in self._errors]
+        if found and len(self.outputs) > 1:
+            found.append(
+                "errors of conditions are taken as independent between outputs, though readings "
+                "of one row share them: the evidence is a little overstated"
+            )
+        return list(dict.fromkeys(found))
 
     def in_noise(self, change: Mapping[str, Array], noise: Mapping[str, Noise]) -> dict[str, Array]:
         """Return changes (k, n) of each output at its field rows, in noise sds, (k, rows)."""
@@ -359,9 +436,10 @@ def campaigns(case: Case) -> Campaigns:
         )
     load = _recorded(lab, "load", _recorded(field, "load", np.array([ASSUMED_LOAD_KN])))
     _check_load(lab, field)
+    expected = _expected(case, outputs)
     order = _recorded(field, "order", np.array([0.0, 1.0]))
     view = View(
-        conditions=dict(field.columns),
+        conditions={**field.columns, **expected},
         lab={name: float(np.nanmedian(values)) for name, values in lab.columns.items()},
         load_kn=float(np.median(load)),
         ground_exponent=_ground_exponent(lab, field),
@@ -418,7 +496,24 @@ def _output(case: Case, name: str, model: str) -> OutputData:
     # What the noise has is not a parameter of the simulator: it is inferred beside it.
     own = len(problem.priors.entries) - 1 - len(problem.noise.parameters)
     priors, along = Priors(problem.priors.entries[:own]), Along.of(problem, case.field.take(rows))
-    return OutputData(name, problem, priors, rows, response, along)
+    errors = WithErrors.of(problem, case.field, rows)
+    return OutputData(name, problem, priors, rows, response, along, errors)
+
+
+def _expected(case: Case, outputs: Sequence[OutputData]) -> dict[str, Array]:
+    """Return the field's conditions that have an error, as they are expected."""
+    each = [{} if o.errors is None else o.errors.expected for o in outputs]
+    found = {name: values for expected in each for name, values in expected.items()}
+    for o, expected in zip(outputs, each, strict=True):
+        for name in found.keys() & {*o.problem.bound.model.conditions}:
+            if name not in expected or not np.array_equal(expected[name], found[name]):
+                raise CalibError(
+                    f"the prior files state different errors of {QUANTITIES[name].word}",
+                    where=case.name,
+                    expected="one error of each condition",
+                    hint="write the same errors and set_points in all prior files of the case",
+                )
+    return found
 
 
 def _check_field(case: Case, name: str, column: str, rows: NDArray[np.int64]) -> None:

@@ -92,6 +92,15 @@ def predictive_draws(
     return from_response(location), from_response(location + noise)
 
 
+@one_thread()
+def row_draws(calibration: Calibration, table: Table, rng: np.random.Generator) -> Array:
+    """Draw readings of the rows of a table, errors of their conditions included, (size, n)."""
+    problem = calibration.problem.with_table(table)
+    natural = problem.theta(calibration.subset(N_DRAWS))
+    location = problem.draw_mean_response(natural, problem.conditions, rng)
+    return problem.bound.from_response(location + problem.draw_noise(natural, rng, apart=True))
+
+
 def prior_predictive(problem: Problem, rng: np.random.Generator) -> Array:
     """Return measurements that the priors expect at the calibrated rows, shape (draws, n)."""
     natural = problem.theta(problem.priors.sample(rng, 1000))

@@ -178,7 +178,7 @@ def test_no_value_at_all_is_told(
     pull_calibration: Calibration, pull_tables: tuple[Table, Table], monkeypatch
 ) -> None:
     monkeypatch.setattr(
-        validate_module, "predictive_draws", lambda *a: (None, np.full((4000, 14), np.nan))
+        validate_module, "row_draws", lambda *a: np.full((4000, 14), np.nan)
     )
     with pytest.raises(CalibError, match="has no value at the held-out rows") as caught:
         validate_held_out(pull_calibration, pull_tables[1])
