@@ -198,48 +198,6 @@ def _misfit_ranges(o: OutputData) -> tuple[tuple[str, float, float], ...]:
 
 
 @dataclass(frozen=True)
-class WithErrors:
-    """What errors of conditions do to one output's rows: the lab's, then the field's.
-
-    Parameters
-    ----------
-    of_field : tuple of ConditionError
-    expected : mapping of str to ndarray
-        Conditions of all field rows that have an error, as they are expected.
-    shift : ndarray, shape (n,)
-        Mean response less that at the expected conditions.
-    added : ndarray, shape (n,)
-        What they add to the variance of the noise, in units of it.
-    """
-
-    of_field: tuple[ConditionError, ...]
-    expected: Mapping[str, Array]
-    shift: Array
-    added: Array
-
-    @classmethod
-    def of(cls, problem: Problem, field: Table, rows: NDArray[np.int64]) -> WithErrors | None:
-        """Work it out where the laboratory's fit has its mode; None where nothing has an error."""
-        noise, bound = problem.noise, problem.bound
-        there = noise_of(noise, bound.model, field, problem.priors.source).errors
-        if not (noise.errors or there):
-            return None
-        in_field = replace(problem, table=field, noise=replace(noise, errors=there))
-        natural = problem.theta(find_mode(problem.log_prob, problem.priors)[None])
-        theta, every = problem.of_model(natural), np.arange(len(problem.table))
-        shifts, added = [], []
-        for part, some in ((problem, every), (in_field, rows)):
-            mean, variance = np.zeros((2, some.size))
-            if part.readings is not None:
-                mean, variance = (m[0, some] for m in part.readings.moments(theta)[:2])
-                mean = mean - bound.mean_response(theta, part.conditions)[0, some]
-            shifts.append(mean)
-            added.append(variance / natural[0, -1] ** 2)
-        expected = {e.name: in_field.conditions[e.name] for e in there}
-        return cls(there, expected, np.concatenate(shifts), np.concatenate(added))
-
-
-@dataclass(frozen=True)
 class OutputData:
     """One modelled output: the simulator's problem on the lab rows, and the field rows.
 
@@ -255,8 +213,8 @@ class OutputData:
         Field rows that have the output.
     field : ndarray
         Their outputs on the scale of the response.
-    errors : WithErrors, optional
-        If conditions of either campaign are known with an error.
+    in_field : Problem, optional
+        On all field rows, if conditions of either campaign are known with an error.
     along : Along, optional
         If the noise is correlated along runs.
     """
@@ -267,7 +225,29 @@ class OutputData:
     rows: NDArray[np.int64]
     field: Array
     along: Along | None = None
-    errors: WithErrors | None = None
+    in_field: Problem | None = None
+
+    @cached_property
+    def by_errors(self) -> tuple[Array, Array | None]:
+        """What errors of conditions do to the rows of the lab, then the field, (n,) each.
+
+        By how much the mean response is off that at the expected conditions, and the variance they
+        add in units of the noise's, both where the laboratory's fit has its mode.
+        """
+        problem, found = self.problem, []
+        if self.in_field is None:
+            return np.zeros(1), None
+        natural = problem.theta(find_mode(problem.log_prob, problem.priors)[None])
+        theta = problem.of_model(natural)
+        for part in (problem, self.in_field):
+            plain = part.bound.mean_response(theta, part.conditions)
+            mean, added = (
+                (plain, 0.0 * plain) if part.readings is None else part.readings.moments(theta)[:2]
+            )
+            rows = slice(None) if part is problem else self.rows
+            found.append(np.stack([mean - plain, added / natural[0, -1] ** 2])[:, 0, rows])
+        shift, added = np.concatenate(found, axis=1)
+        return shift, added
 
     @cached_property
     def role(self) -> str:
@@ -349,7 +329,7 @@ class Campaigns:
             o.name: replace(
                 self.lab_at[o.name] + field.rows(o.rows),
                 along=o.along,
-                added=None if o.errors is None else o.errors.added,
+                added=o.by_errors[1],
             )
             for o in self.outputs
         }
@@ -363,33 +343,28 @@ class Campaigns:
     @cached_property
     def observed(self) -> Array:
         """Lab rows, then field rows, of one output after the other, on the responses' scales."""
-        both = [np.append(o.problem.response, o.field) for o in self.outputs]
-        shifts = (0.0 if o.errors is None else o.errors.shift for o in self.outputs)
-        return np.concatenate([v - shift for v, shift in zip(both, shifts, strict=True)])
+        both = (np.append(o.problem.response, o.field) - o.by_errors[0] for o in self.outputs)
+        return np.concatenate([*both])
 
     @cached_property
-    def _errors(self) -> list[tuple[Table, ConditionError]]:
-        """Errors of conditions, each with the campaign."""
-        case = self.case
-        found = [(case.lab, e) for o in self.outputs for e in o.problem.noise.errors]
-        there = [o.errors.of_field for o in self.outputs if o.errors is not None]
-        return found + [(case.field, e) for errors in there for e in errors]
-
-    @property
-    def error_columns(self) -> set[str]:
-        """Columns that errors of conditions are in."""
-        return {error.sd for _, error in self._errors if isinstance(error.sd, str)}
+    def errors(self) -> list[tuple[Table, ConditionError]]:
+        """Errors of conditions, each with its campaign."""
+        pairs = [(o.problem, o.in_field) for o in self.outputs if o.in_field is not None]
+        both = (self.case.lab, self.case.field)
+        return [
+            (t, e) for p in pairs for t, of in zip(both, p, strict=True) for e in of.noise.errors
+        ]
 
     @property
     def said_of_errors(self) -> list[str]:
-        """Say what is allowed for as errors of conditions, of either campaign."""
-        found = [f"{table.source}: {error.words()}" for table, error in self._errors]
+        """Say what is allowed for as errors of conditions."""
+        found = dict.fromkeys(f"{table.source}: {error.words()}" for table, error in self.errors)
         if found and len(self.outputs) > 1:
-            found.append(
+            found[
                 "errors of conditions are taken as independent between outputs, though readings "
                 "of one row share them: the evidence is a little overstated"
-            )
-        return list(dict.fromkeys(found))
+            ] = None
+        return [*found]
 
     def in_noise(self, change: Mapping[str, Array], noise: Mapping[str, Noise]) -> dict[str, Array]:
         """Return changes (k, n) of each output at its field rows, in noise sds, (k, rows)."""
@@ -436,10 +411,9 @@ def campaigns(case: Case) -> Campaigns:
         )
     load = _recorded(lab, "load", _recorded(field, "load", np.array([ASSUMED_LOAD_KN])))
     _check_load(lab, field)
-    expected = _expected(case, outputs)
     order = _recorded(field, "order", np.array([0.0, 1.0]))
     view = View(
-        conditions={**field.columns, **expected},
+        conditions=_expected(outputs, field),
         lab={name: float(np.nanmedian(values)) for name, values in lab.columns.items()},
         load_kn=float(np.median(load)),
         ground_exponent=_ground_exponent(lab, field),
@@ -496,24 +470,26 @@ def _output(case: Case, name: str, model: str) -> OutputData:
     # What the noise has is not a parameter of the simulator: it is inferred beside it.
     own = len(problem.priors.entries) - 1 - len(problem.noise.parameters)
     priors, along = Priors(problem.priors.entries[:own]), Along.of(problem, case.field.take(rows))
-    errors = WithErrors.of(problem, case.field, rows)
-    return OutputData(name, problem, priors, rows, response, along, errors)
+    there = noise_of(problem.noise, problem.bound.model, case.field, problem.priors.source)
+    some = bool(problem.noise.errors or there.errors)
+    in_field = replace(problem, table=case.field, noise=there) if some else None
+    return OutputData(name, problem, priors, rows, response, along, in_field)
 
 
-def _expected(case: Case, outputs: Sequence[OutputData]) -> dict[str, Array]:
-    """Return the field's conditions that have an error, as they are expected."""
-    each = [{} if o.errors is None else o.errors.expected for o in outputs]
-    found = {name: values for expected in each for name, values in expected.items()}
-    for o, expected in zip(outputs, each, strict=True):
-        for name in found.keys() & {*o.problem.bound.model.conditions}:
-            if name not in expected or not np.array_equal(expected[name], found[name]):
+def _expected(outputs: Sequence[OutputData], field: Table) -> dict[str, Array]:
+    """Return the field's conditions, those that have an error as they are expected."""
+    found: dict[str, Array] = {}
+    for o in outputs:
+        own = o.problem.bound.model.select(field.columns)
+        for name, values in (own if o.in_field is None else o.in_field.conditions).items():
+            if not np.array_equal(found.setdefault(name, values), values):
                 raise CalibError(
                     f"the prior files state different errors of {QUANTITIES[name].word}",
-                    where=case.name,
+                    where=field.source,
                     expected="one error of each condition",
                     hint="write the same errors and set_points in all prior files of the case",
                 )
-    return found
+    return {**field.columns, **found}
 
 
 def _check_field(case: Case, name: str, column: str, rows: NDArray[np.int64]) -> None:

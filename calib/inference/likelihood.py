@@ -160,8 +160,7 @@ class Noise:
     runs neighbours may be correlated; what they are counted in, or empty for independent rows. On
     data (`noise_of`), the column that the scale depends on, its mean and its sd are known too.
 
-    It stands here too which conditions have an error, and which of them are set points; on data
-    with what these tell of them.
+    It has the errors of conditions too: as stated, with set points; and as they are on data.
     """
 
     family: Family = "normal"
@@ -204,9 +203,8 @@ class Noise:
                 f"{what} takes normal noise of one standard deviation only"
                 + (", and no errors of conditions" if self.errors else ""),
                 where=f"{source}, [likelihood]",
-                hint="write errors = {} in this table, which leaves them out"
-                if self.errors
-                else "take this table out, and fit again what was fitted with it",
+                hint="take this table out (or leave errors = {} alone in it: no errors), and fit "
+                "again what was fitted with it",
             )
 
     def must_be_normal_of_one_sd(self, source: str) -> None:

@@ -207,9 +207,13 @@ class Problem:
     @cached_property
     def squares(self) -> SumOfSquares:
         """Sums of squared residuals, on the scale of the response, of natural parameters."""
-        if self.readings is not None:
-            return SumOfSquares.of(self.readings, self.readings.around, self.response)
-        return SumOfSquares.of(self.bound, self.conditions, self.response)
+        return SumOfSquares.of(*self._predictor, self.response)
+
+    @cached_property
+    def _predictor(self) -> tuple[BoundModel | Readings, Conditions]:
+        """What has the mean response, and the conditions that it is asked for."""
+        rows = self.readings
+        return (self.bound, self.conditions) if rows is None else (rows, rows.around)
 
     @cached_property
     def serial(self) -> Serial | None:
@@ -234,22 +238,15 @@ class Problem:
 
     def residuals(self, natural: Array) -> Array:
         """Observed minus predicted on the scale of the response, shape (k, n)."""
-        readings = self.readings
+        predictor, at = self._predictor
 
         def observed_minus_predicted(some: Array) -> Array:
-            theta = self.of_model(some)
-            if readings is not None:
-                return self.response - readings.mean_response(theta, readings.around)
-            return self.response - self.bound.mean_response(theta, self.conditions)
+            return self.response - predictor.mean_response(self.of_model(some), at)
 
-        size = self.response.size if readings is None else readings.size
-        return in_chunks(observed_minus_predicted, natural, size)
+        return in_chunks(observed_minus_predicted, natural, self.response.size)
 
     def scale(self, natural: Array) -> Array:
-        """Return the scale of the rows' residuals, of natural parameters (k, d_all), (k, n or 1).
-
-        The errors of their conditions are in it.
-        """
+        """Return the scale of the rows' residuals, errors of conditions in it, (k, n or 1)."""
         scale = self.noise.scale(natural, self.conditions)
         if self.readings is None:
             return scale
@@ -328,24 +325,19 @@ class Problem:
     def log_likelihood_left_out(self, t: Array) -> Array:
         """Log density of every row given all others and the parameters, shape (k, n)."""
         if (rows := self.readings) is not None:
-            natural = self.theta(t)
-
-            def left_out(some: Array) -> Array:
-                residuals, *of = self._with_errors(rows, some)
-                mean, variance = given_all_others(residuals, *of)
-                return self.noise.log_density(residuals - mean, some, np.sqrt(variance))
-
+            residuals, *of = self._with_errors(rows, natural := self.theta(t))
             with np.errstate(all="ignore"):
-                return in_chunks(left_out, natural, rows.size) + self._ln_jacobian
+                mean, variance = given_all_others(residuals, *of)
+            scale = np.sqrt(variance)
+            return self.noise.log_density(residuals - mean, natural, scale) + self._ln_jacobian
         if self.serial is None:
             return self.log_likelihood_rows(t)
         return self._log_densities(self.theta(t), Serial.given_all_others) + self._ln_jacobian
 
     def draw_noise(self, natural: Array, rng: np.random.Generator, *, apart: bool = False) -> Array:
-        """Draw the noise of the rows for each parameter vector, shape (k, n).
+        """Draw the noise of the rows, or of each by itself (`apart`), for each vector, (k, n).
 
-        With what errors of conditions make of the prediction. Of rows by themselves (`apart`) one
-        does not depend on another.
+        It has in it what errors of conditions make of the prediction.
         """
         n, serial = self.response.size, None if apart else self.serial
         if self.readings is not None:
@@ -364,9 +356,8 @@ class Problem:
         """Log likelihood of every row by itself, shape (k, n)."""
         natural, uncertain = self.theta(t), self.bound.model.uncertain
         if uncertain is None:
-            scale = self.scale(natural)
-            density = self.noise.log_density(self.residuals(natural), natural, scale)
-            return density + self._ln_jacobian
+            residuals, scale = self.residuals(natural), self.scale(natural)
+            return self.noise.log_density(residuals, natural, scale) + self._ln_jacobian
         predicted, unknown, curves = uncertain(self.of_model(natural), self.conditions)
         sigma = np.sqrt(natural[:, -1:] ** 2 + unknown[:, None] * (curves**2).sum(axis=1))
         z = (self.response - predicted) / sigma
