@@ -72,7 +72,7 @@ def slope_of(problem: Problem) -> tuple[float, float]:
 # The classic examples, many times over
 
 
-TIMES = 100
+TIMES = 60
 
 
 def coverage(sd: float, declared: float, *, set_point: bool):
@@ -135,32 +135,35 @@ def test_it_is_the_likelihood_of_the_bivariate_normal() -> None:
 
 
 @pytest.mark.parametrize("set_point", [False, True])
-def test_a_row_of_a_curve_is_as_by_quadrature_over_its_true_slip(set_point: bool) -> None:
+def test_rows_of_a_curve_are_as_by_quadrature_over_their_true_slips(set_point: bool) -> None:
+    """Off by a twentieth of what neglect costs; half the error is off by less than a quarter."""
+
     def curve(peak, slip):
         return peak * np.tanh(slip / 0.15)
 
-    def joint(u, i):
-        return stats.norm.pdf(u, m[i], s[i]) * stats.norm.pdf(pull[i], curve(1.4, u), noise)
+    def joint(u, m, s, y):
+        return stats.norm.pdf(u, m, s) * stats.norm.pdf(y, curve(1.5, u), noise)
 
-    rng, sd, noise = np.random.default_rng(4), 0.02, 0.05
-    slip = np.linspace(0.02, 0.6, 30) + sd * rng.standard_normal(30)
+    rng, noise = np.random.default_rng(4), 0.05
+    slip = np.linspace(0.02, 0.6, 30)
     pull = curve(1.5, slip) + noise * rng.standard_normal(30)
     priors = [normal("peak", 1.5, 0.3), normal("sigma", -3.0, 1.0, log=True)]
-    problem = with_error(problem_of(curve, priors, slip, pull), sd, set_point=set_point)
-    t = np.array([[1.4, np.log(noise)]])
-    found = problem.log_likelihood_rows(t)[0]
-    plain = with_error(problem, 0.0).log_likelihood_rows(t)[0]
-    m, s = slip, np.full(30, sd)
-    if not set_point:
-        kept = 1.0 - sd**2 / slip.var(ddof=1)
-        m, s = slip.mean() + kept * (slip - slip.mean()), np.full(30, sd * np.sqrt(kept))
-    expected = [
-        np.log(quad(joint, m[i] - 8.0 * s[i], m[i] + 8.0 * s[i], (i,), epsabs=1e-10)[0])
-        for i in range(30)
-    ]
-    off, neglected = (np.sqrt(np.mean((v - expected) ** 2)) for v in (found, plain))
-    assert neglected > 1.0
-    assert off < 0.02 * neglected
+    t, plain = np.array([[1.5, np.log(noise)]]), problem_of(curve, priors, slip, pull)
+    off = []
+    for sd in (0.005, 0.01):
+        kept = 1.0 if set_point else 1.0 - sd**2 / slip.var(ddof=1)
+        means, s = slip.mean() + kept * (slip - slip.mean()), sd * np.sqrt(kept)
+        expected = [
+            np.log(quad(joint, m - 8.0 * s, m + 8.0 * s, (m, s, y), epsabs=1e-10)[0])
+            for m, y in zip(means, pull, strict=True)
+        ]
+        found, neglected = (
+            np.sqrt(np.mean((p.log_likelihood_rows(t)[0] - expected) ** 2))
+            for p in (with_error(plain, sd, set_point=set_point), plain)
+        )
+        assert found < 0.05 * neglected
+        off.append(found)
+    assert off[0] < 0.25 * off[1]
 
 
 def test_densities_and_draws_are_those_of_the_dense_covariance() -> None:
