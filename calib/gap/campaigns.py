@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -26,6 +26,9 @@ from calib.gap.noise import (
     noise_conditions,
     noise_conditions_of_lab,
 )
+from calib.inference.condition_errors import ConditionError
+from calib.inference.likelihood import noise_of
+from calib.inference.mode import find_mode
 from calib.inference.priors import Priors
 from calib.inference.problem import Problem, build_problem
 from calib.models import MODELS, get_model
@@ -210,6 +213,8 @@ class OutputData:
         Field rows that have the output.
     field : ndarray
         Their outputs on the scale of the response.
+    in_field : Problem, optional
+        On all field rows, if conditions of either campaign are known with an error.
     along : Along, optional
         If the noise is correlated along runs.
     """
@@ -220,6 +225,29 @@ class OutputData:
     rows: NDArray[np.int64]
     field: Array
     along: Along | None = None
+    in_field: Problem | None = None
+
+    @cached_property
+    def by_errors(self) -> tuple[Array, Array | None]:
+        """What errors of conditions do to the rows of the lab, then the field, (n,) each.
+
+        By how much the mean response is off that at the expected conditions, and the variance they
+        add in units of the noise's, both where the laboratory's fit has its mode.
+        """
+        problem, found = self.problem, []
+        if self.in_field is None:
+            return np.zeros(1), None
+        natural = problem.theta(find_mode(problem.log_prob, problem.priors)[None])
+        theta = problem.of_model(natural)
+        for part in (problem, self.in_field):
+            plain = part.bound.mean_response(theta, part.conditions)
+            mean, added = (
+                (plain, 0.0 * plain) if part.readings is None else part.readings.moments(theta)[:2]
+            )
+            rows = slice(None) if part is problem else self.rows
+            found.append(np.stack([mean - plain, added / natural[0, -1] ** 2])[:, 0, rows])
+        shift, added = np.concatenate(found, axis=1)
+        return shift, added
 
     @cached_property
     def role(self) -> str:
@@ -229,8 +257,7 @@ class OutputData:
     def lab_residuals(self, mode: Array) -> Array:
         """Return the residuals of the laboratory's fit at a vector of its priors, shape (n,)."""
         natural = self.priors.to_natural(mode[None])
-        predicted = self.problem.bound.mean_response(natural, self.problem.conditions)[0]
-        return np.asarray(self.problem.response - predicted)
+        return np.asarray(self.problem.residuals(natural)[0])
 
 
 @dataclass(frozen=True)
@@ -299,7 +326,11 @@ class Campaigns:
         """What the noise of every output's lab rows, then field rows, depends on."""
         field = noise_conditions(self.view)
         return {
-            o.name: replace(self.lab_at[o.name] + field.rows(o.rows), along=o.along)
+            o.name: replace(
+                self.lab_at[o.name] + field.rows(o.rows),
+                along=o.along,
+                added=o.by_errors[1],
+            )
             for o in self.outputs
         }
 
@@ -312,7 +343,28 @@ class Campaigns:
     @cached_property
     def observed(self) -> Array:
         """Lab rows, then field rows, of one output after the other, on the responses' scales."""
-        return np.concatenate([v for o in self.outputs for v in (o.problem.response, o.field)])
+        both = (np.append(o.problem.response, o.field) - o.by_errors[0] for o in self.outputs)
+        return np.concatenate([*both])
+
+    @cached_property
+    def errors(self) -> list[tuple[Table, ConditionError]]:
+        """Errors of conditions, each with its campaign."""
+        pairs = [(o.problem, o.in_field) for o in self.outputs if o.in_field is not None]
+        both = (self.case.lab, self.case.field)
+        return [
+            (t, e) for p in pairs for t, of in zip(both, p, strict=True) for e in of.noise.errors
+        ]
+
+    @property
+    def said_of_errors(self) -> list[str]:
+        """Say what is allowed for as errors of conditions."""
+        found = dict.fromkeys(f"{table.source}: {error.words()}" for table, error in self.errors)
+        if found and len(self.outputs) > 1:
+            found[
+                "errors of conditions are taken as independent between outputs, though readings "
+                "of one row share them: the evidence is a little overstated"
+            ] = None
+        return [*found]
 
     def in_noise(self, change: Mapping[str, Array], noise: Mapping[str, Noise]) -> dict[str, Array]:
         """Return changes (k, n) of each output at its field rows, in noise sds, (k, rows)."""
@@ -361,7 +413,7 @@ def campaigns(case: Case) -> Campaigns:
     _check_load(lab, field)
     order = _recorded(field, "order", np.array([0.0, 1.0]))
     view = View(
-        conditions=dict(field.columns),
+        conditions=_expected(outputs, field),
         lab={name: float(np.nanmedian(values)) for name, values in lab.columns.items()},
         load_kn=float(np.median(load)),
         ground_exponent=_ground_exponent(lab, field),
@@ -418,7 +470,26 @@ def _output(case: Case, name: str, model: str) -> OutputData:
     # What the noise has is not a parameter of the simulator: it is inferred beside it.
     own = len(problem.priors.entries) - 1 - len(problem.noise.parameters)
     priors, along = Priors(problem.priors.entries[:own]), Along.of(problem, case.field.take(rows))
-    return OutputData(name, problem, priors, rows, response, along)
+    there = noise_of(problem.noise, problem.bound.model, case.field, problem.priors.source)
+    some = bool(problem.noise.errors or there.errors)
+    in_field = replace(problem, table=case.field, noise=there) if some else None
+    return OutputData(name, problem, priors, rows, response, along, in_field)
+
+
+def _expected(outputs: Sequence[OutputData], field: Table) -> dict[str, Array]:
+    """Return the field's conditions, those that have an error as they are expected."""
+    found: dict[str, Array] = {}
+    for o in outputs:
+        own = o.problem.bound.model.select(field.columns)
+        for name, values in (own if o.in_field is None else o.in_field.conditions).items():
+            if not np.array_equal(found.setdefault(name, values), values):
+                raise CalibError(
+                    f"the prior files state different errors of {QUANTITIES[name].word}",
+                    where=field.source,
+                    expected="one error of each condition",
+                    hint="write the same errors and set_points in all prior files of the case",
+                )
+    return {**field.columns, **found}
 
 
 def _check_field(case: Case, name: str, column: str, rows: NDArray[np.int64]) -> None:

@@ -102,6 +102,8 @@ def save_corrected(corrected: Corrected, folder: Path) -> None:
     for key, (name, table) in zip(("calibration", "field", "predict"), tables.items(), strict=True):
         if table is not None:
             columns = table.as_in_file(cells(table.columns, case.covariates))
+            sds = {error.sd for _, error in corrected.data.errors}
+            columns |= {name: cells for name, cells in table.extra.items() if name in sds}
             if name == "fresh" and table.text:  # its predictions repeat it as it was written
                 columns |= dict(zip(table.header, zip(*table.text, strict=True), strict=True))
             write_table(inner / f"{name}.csv", columns)

@@ -230,6 +230,7 @@ def diagnose_once(
             *(remark.text for remark in remarks),
             *oddities(case.lab, case.field, case.models),
             *new_values(case.covariates, case.lab, case.field),
+            *data.said_of_errors,
             *said,
         ),
         unused_rows(data, case.field),

@@ -66,11 +66,14 @@ class NoiseConditions:
         it is not recorded.
     along : Along, optional
         If neighbours along a run are correlated.
+    added : ndarray, optional
+        What errors of the rows' conditions add to the square of the growth.
     """
 
     slip: Array
     softness: Array
     along: Along | None = None
+    added: Array | None = None
 
     @cached_property
     def grid(self) -> list[Noise]:
@@ -114,7 +117,8 @@ class NoiseConditions:
     def growth(self, rho: float, kappa: float) -> Array:
         """Growth of the noise, shape (n,)."""
         with_slip = 1.0 + rho * np.maximum(self.slip, 0.0)
-        return np.asarray(with_slip * np.exp(kappa * self.softness))
+        grown = with_slip * np.exp(kappa * self.softness)
+        return np.asarray(grown if self.added is None else np.hypot(grown, np.sqrt(self.added)))
 
     def rows(self, rows: NDArray[np.int64]) -> NoiseConditions:
         """Some of the rows."""

@@ -544,7 +544,7 @@ def run_problem(record: RunRecord, data: Path) -> Problem:
     if record.header:
         table = replace(table, header=record.header, text=())
     # A run holds the rows that it was calibrated on: those that the noise is measured by.
-    noise = noise_of(priors.noise, model.select(table.columns), record.prior_file)
+    noise = noise_of(priors.noise, model, table, record.prior_file)
     return Problem(BoundModel(model, record.references), table, priors, noise=noise)
 
 

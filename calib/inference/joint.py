@@ -295,7 +295,7 @@ def _linear(part: Part, h: Array, theta: Array, q: int) -> _Centre:
     natural = problem.theta(
         t + np.concatenate([np.zeros((1, t.size)), *(np.diag(s * steps) for s in (1, -1))])
     )
-    scale = problem.noise.scale(natural[:1], problem.conditions)
+    scale = problem.scale(natural[:1])
     residuals = np.nan_to_num(problem.residuals(natural) / scale)
     ahead, behind = residuals[1:].reshape(2, t.size, -1)
     jacobian = (behind - ahead).T / (2.0 * steps)  # of the prediction, (n, d)
@@ -368,7 +368,11 @@ def build_joint(
                 where="build_joint", expected="readings of its own for each model",
                 hint="compare them (`calib.compare`)",
             )  # fmt: skip
-        wholes[output] = build_problem(name, table, files.get(name), others=others)
+        whole = build_problem(name, table, files.get(name), others=others)
+        # What outputs read at one row have in common, its conditions' errors, would count twice.
+        if whole.noise.errors:
+            whole.noise.must_be_iid_normal(whole.priors.source, "a joint fit")
+        wholes[output] = whole
         if group:
             labels[output] = group_labels(table, group)
     if bool(group) != bool(pooled):

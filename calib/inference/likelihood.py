@@ -24,6 +24,9 @@ The noise. By default it is normal of one standard deviation sigma. A prior file
   Series Analysis, section 3.2). Different runs are independent. Each row depends on the others
   through its two neighbours alone (Bürkner, Gabry & Vehtari 2021, doi:10.1007/s00180-020-01045-4).
 
+Conditions that are known with an error (`calib.inference.condition_errors`) add to the variance of
+normal noise.
+
 Natural parameters are those of the model, then nu, sigma_slope and rho if they are there, then
 sigma.
 """
@@ -41,8 +44,9 @@ from scipy.special import gammaln, ndtr, ndtri, stdtr, stdtrit
 from calib.data import Table
 from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
+from calib.inference.condition_errors import ConditionError, Readings, Stated, errors_of
 from calib.inference.constants import CHUNK_CELLS, HALF_LN_2PI
-from calib.models.base import Array, BoundModel, Conditions
+from calib.models.base import Array, BoundModel, Conditions, Model
 
 
 def in_chunks(function: Callable[[Array], Array], vectors: Array, n_rows: int) -> Array:
@@ -54,7 +58,7 @@ def in_chunks(function: Callable[[Array], Array], vectors: Array, n_rows: int) -
 
 @dataclass(frozen=True)
 class SumOfSquares:
-    """Sum of squared residuals of a bound model on fixed data.
+    """Sum of squared residuals of a bound model, or of readings, on fixed data.
 
     Parameters
     ----------
@@ -64,14 +68,16 @@ class SumOfSquares:
         Sum of squares of the repeats about their means.
     """
 
-    bound: BoundModel
+    bound: BoundModel | Readings
     conditions: Conditions
     mean: Array
     repeats: Array
     within: float
 
     @classmethod
-    def of(cls, bound: BoundModel, conditions: Conditions, response: Array) -> SumOfSquares:
+    def of(
+        cls, bound: BoundModel | Readings, conditions: Conditions, response: Array
+    ) -> SumOfSquares:
         """Arrange conditions and responses (n,) for a bound model."""
         distinct, code, count = np.unique(
             np.stack(list(conditions.values())), axis=1, return_inverse=True, return_counts=True
@@ -156,6 +162,8 @@ class Noise:
     It may depend on a quantity, or its canonical column; empty for one scale at all conditions. In
     runs neighbours may be correlated; what they are counted in, or empty for independent rows. On
     data (`noise_of`), the column that the scale depends on, its mean and its sd are known too.
+
+    It has the errors of conditions too: as stated, with set points; and as they are on data.
     """
 
     family: Family = "normal"
@@ -164,6 +172,9 @@ class Noise:
     column: str = ""
     centre: float = 0.0
     spread: float = 1.0
+    stated: Stated | None = None
+    set_points: tuple[str, ...] = ()
+    errors: tuple[ConditionError, ...] = ()
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -176,7 +187,12 @@ class Noise:
     @property
     def iid_normal(self) -> bool:
         """Whether it is independent and normal, of one standard deviation."""
-        return not self.parameters
+        return not (self.parameters or self.errors)
+
+    @property
+    def of_errors(self) -> Noise:
+        """Normal noise of one standard deviation, with the same errors of conditions."""
+        return Noise(stated=self.stated, set_points=self.set_points, errors=self.errors)
 
     @property
     def student(self) -> bool:
@@ -187,14 +203,17 @@ class Noise:
         """Raise a CalibError unless it is, for what is worked out for that noise alone."""
         if not self.iid_normal:
             raise CalibError(
-                f"{what} takes normal noise of one standard deviation only",
+                f"{what} takes normal noise of one standard deviation only"
+                + (", and no errors of conditions" if self.errors else ""),
                 where=f"{source}, [likelihood]",
-                hint="take this table out, and fit again what was fitted with it",
+                hint="take this table out (or leave errors = {} alone in it: no errors), and fit "
+                "again what was fitted with it",
             )
 
     def must_be_normal_of_one_sd(self, source: str) -> None:
-        """Raise a CalibError unless it is, for a diagnosis, whatever it is correlated along."""
-        replace(self, correlated_along="").must_be_iid_normal(source, "a diagnosis")
+        """Raise a CalibError unless it is, for a diagnosis, but for correlation and errors."""
+        plain = replace(self, correlated_along="", errors=())
+        plain.must_be_iid_normal(source, "a diagnosis")
 
     def scale(self, natural: Array, conditions: Mapping[str, Array]) -> Array:
         """Return the scale at conditions: natural parameters (k, d_all) to (k, 1) or (k, n)."""
@@ -232,12 +251,9 @@ class Noise:
             z = -np.sign(z) * stdtrit(self.own("nu", natural), ndtr(-np.abs(z)))
         return np.asarray(self.scale(natural, conditions) * z)
 
-    def log_density(
-        self, residuals: Array, natural: Array, conditions: Mapping[str, Array]
-    ) -> Array:
-        """Log density of residuals (k, n), each by itself; NaN where a residual is."""
+    def log_density(self, residuals: Array, natural: Array, scale: Array) -> Array:
+        """Log density of residuals (k, n) of a scale, each by itself; NaN where a residual is."""
         with np.errstate(all="ignore"):
-            scale = self.scale(natural, conditions)
             z = residuals / scale
             if not self.student:
                 return np.asarray(-0.5 * z * z - np.log(scale) - HALF_LN_2PI)
@@ -246,11 +262,9 @@ class Noise:
             constant = gammaln(half) - gammaln(0.5 * nu) - 0.5 * np.log(np.pi * nu)
             return np.asarray(constant - np.log(scale) - half * np.log1p(z * z / nu))
 
-    def normal_scores(
-        self, residuals: Array, natural: Array, conditions: Mapping[str, Array]
-    ) -> Array:
+    def normal_scores(self, residuals: Array, natural: Array, scale: Array) -> Array:
         """Residuals (k, n) as they would stand in standard normal noise: of the same quantile."""
-        z = residuals / self.scale(natural, conditions)
+        z = residuals / scale
         if not self.student:
             return np.asarray(z)
         return np.asarray(-np.sign(z) * ndtri(stdtr(self.own("nu", natural), -np.abs(z))))
@@ -259,14 +273,25 @@ class Noise:
 IID_NORMAL = Noise()
 
 
-def noise_of(noise: Noise, conditions: Conditions, source: str) -> Noise:
-    """Return a noise on the rows, (n,), that are calibrated on.
+def noise_of(noise: Noise, model: Model, table: Table, source: str) -> Noise:
+    """Return a noise on the rows that are calibrated on.
 
     Raises
     ------
     CalibError
-        If the noise is to depend on what is no condition of the model, or does not vary.
+        If the noise is to depend on what is no condition of the model, or does not vary; as
+        `errors_of` does, and if errors of conditions go with other noise than they can.
     """
+    conditions = model.select(table.columns)
+    errors = errors_of(noise.stated, noise.set_points, conditions, table, source)
+    noise = replace(noise, errors=errors)
+    if errors and (noise.student or noise.correlated_along):
+        kind = "Student-t noise" if noise.student else "noise that is correlated along a run"
+        raise CalibError(
+            f"the error of {errors[0].column.quantity.word} cannot be allowed for in {kind}",
+            where=f"{source}, [likelihood]", expected="independent normal noise",
+            hint="take that noise out, or write errors = {} to leave the errors out",
+        )  # fmt: skip
     if not noise.depends_on:
         return noise
     stems = {QUANTITIES[name].stem: name for name in conditions}

@@ -107,6 +107,8 @@ class LikelihoodTable(BaseModel):
     family: Family = "normal"
     noise_depends_on: str = ""
     correlated_along: Along = ""
+    errors: dict[str, _Positive | str] | None = None
+    set_points: tuple[str, ...] = ()
 
 
 class PriorFileContent(BaseModel):
@@ -553,10 +555,15 @@ def _noise_choice(content: Mapping[str, Any], source: str, parameters: Sequence[
         raise CalibError(
             in_words(first), where=where,
             expected='family = "normal" or "student_t", noise_depends_on = "slip" or another '
-            'condition of the model, correlated_along = "run_order"',
+            'condition of the model, correlated_along = "run_order", errors = {slip_percent = 1.5} '
+            'or = {slip = "slip_percent_sd"}, set_points = ["slip"]',
             hint="correct this entry",
         ) from None  # fmt: skip
-    noise = Noise(chosen.family, chosen.noise_depends_on, chosen.correlated_along)
+    stated = None if chosen.errors is None else tuple(chosen.errors.items())
+    noise = Noise(
+        chosen.family, chosen.noise_depends_on, chosen.correlated_along,
+        stated=stated, set_points=chosen.set_points,
+    )  # fmt: skip
     if noise.correlated_along and noise.family != "normal":
         raise CalibError(
             "noise that is correlated along a run is normal", where=where,

@@ -32,6 +32,7 @@ from calib.data.quantities import QUANTITIES
 from calib.data.reader import Tabular
 from calib.data.table import accepted_headers
 from calib.errors import CalibError
+from calib.inference.condition_errors import Readings, given_all_others, log_density
 from calib.inference.constants import HALF_LN_2PI
 from calib.inference.likelihood import (
     IID_NORMAL,
@@ -172,9 +173,16 @@ class Problem:
         return len(self.names)
 
     @cached_property
+    def readings(self) -> Readings | None:
+        """The rows, where conditions are known with an error."""
+        errors = self.noise.errors
+        return Readings.of(self.bound, errors, self.table) if errors else None
+
+    @cached_property
     def conditions(self) -> dict[str, Array]:
-        """The model's conditions, each of shape (n,)."""
-        return self.bound.model.select(self.table.columns)
+        """The model's conditions, each of shape (n,); of those with an error what is expected."""
+        recorded = self.bound.model.select(self.table.columns)
+        return recorded if self.readings is None else self.readings.conditions
 
     @cached_property
     def observed(self) -> Array:
@@ -199,7 +207,13 @@ class Problem:
     @cached_property
     def squares(self) -> SumOfSquares:
         """Sums of squared residuals, on the scale of the response, of natural parameters."""
-        return SumOfSquares.of(self.bound, self.conditions, self.response)
+        return SumOfSquares.of(*self._predictor, self.response)
+
+    @cached_property
+    def _predictor(self) -> tuple[BoundModel | Readings, Conditions]:
+        """What has the mean response, and the conditions that it is asked for."""
+        rows = self.readings
+        return (self.bound, self.conditions) if rows is None else (rows, rows.around)
 
     @cached_property
     def serial(self) -> Serial | None:
@@ -224,11 +238,27 @@ class Problem:
 
     def residuals(self, natural: Array) -> Array:
         """Observed minus predicted on the scale of the response, shape (k, n)."""
+        predictor, at = self._predictor
 
         def observed_minus_predicted(some: Array) -> Array:
-            return self.response - self.bound.mean_response(self.of_model(some), self.conditions)
+            return self.response - predictor.mean_response(self.of_model(some), at)
 
         return in_chunks(observed_minus_predicted, natural, self.response.size)
+
+    def scale(self, natural: Array) -> Array:
+        """Return the scale of the rows' residuals, errors of conditions in it, (k, n or 1)."""
+        scale = self.noise.scale(natural, self.conditions)
+        if self.readings is None:
+            return scale
+        return np.hypot(scale, np.sqrt(self.readings.moments(self.of_model(natural))[1]))
+
+    def _with_errors(self, readings: Readings, some: Array) -> tuple[Array, Array, Array]:
+        """Residuals and their variances, (k, n), and what they are off along, (k, n, j)."""
+        mean, added, curves = readings.moments(self.of_model(some))
+        scale = self.noise.scale(some, self.conditions)
+        # No scale is negative.
+        variance = np.where(scale > 0.0, scale**2, np.nan) + added
+        return self.response - mean, variance, curves
 
     def draw_mean_response(
         self, natural: Array, conditions: Conditions, rng: np.random.Generator
@@ -276,6 +306,10 @@ class Problem:
                     else self.squares.about(predicted)
                 )
                 value = -n * (np.log(sigma) + HALF_LN_2PI) - 0.5 * sse / sigma**2
+            elif (rows := self.readings) is not None:
+                value = in_chunks(
+                    lambda some: log_density(*self._with_errors(rows, some)), natural, rows.size
+                )
             else:
                 value = in_chunks(
                     lambda some: self._log_densities(some, Serial.before).sum(axis=1), natural, n
@@ -287,7 +321,7 @@ class Problem:
         """Log density of the noise of every row given others, where it is correlated, (k, n)."""
         residuals, serial = self.residuals(natural), self.serial
         if serial is None:
-            return self.noise.log_density(residuals, natural, self.conditions)
+            return self.noise.log_density(residuals, natural, self.scale(natural))
         with np.errstate(all="ignore"):
             scale = self.noise.scale(natural, self.conditions)
             z = residuals / scale
@@ -297,20 +331,37 @@ class Problem:
 
     def log_likelihood_left_out(self, t: Array) -> Array:
         """Log density of every row given all others and the parameters, shape (k, n)."""
+        if (rows := self.readings) is not None:
+            residuals, *of = self._with_errors(rows, natural := self.theta(t))
+            with np.errstate(all="ignore"):
+                mean, variance = given_all_others(residuals, *of)
+            scale = np.sqrt(variance)
+            return self.noise.log_density(residuals - mean, natural, scale) + self._ln_jacobian
         if self.serial is None:
             return self.log_likelihood_rows(t)
         return self._log_densities(self.theta(t), Serial.given_all_others) + self._ln_jacobian
 
-    def draw_noise(self, natural: Array, rng: np.random.Generator) -> Array:
-        """Draw the noise of the rows for each parameter vector, shape (k, n)."""
-        return self.noise.draw(natural, self.conditions, rng, self.response.size, self.serial)
+    def draw_noise(self, natural: Array, rng: np.random.Generator, *, apart: bool = False) -> Array:
+        """Draw the noise of the rows, or of each by itself (`apart`), for each vector, (k, n).
+
+        It has in it what errors of conditions make of the prediction.
+        """
+        n, serial = self.response.size, None if apart else self.serial
+        if self.readings is not None:
+            theta, z = self.of_model(natural), rng.standard_normal((len(natural), n))
+            mean, _, curves = self.readings.moments(theta)
+            noise = mean - self.bound.mean_response(theta, self.conditions)
+            noise += self.scale(natural) * z
+            off = rng.standard_normal((len(natural), curves.shape[2], 1))
+            return noise if apart else noise + (curves @ off)[..., 0]
+        return self.noise.draw(natural, self.conditions, rng, n, serial)
 
     def log_likelihood_rows(self, t: Array) -> Array:
         """Log likelihood of every row by itself, shape (k, n)."""
         natural, uncertain = self.theta(t), self.bound.model.uncertain
         if uncertain is None:
-            density = self.noise.log_density(self.residuals(natural), natural, self.conditions)
-            return density + self._ln_jacobian
+            residuals, scale = self.residuals(natural), self.scale(natural)
+            return self.noise.log_density(residuals, natural, scale) + self._ln_jacobian
         predicted, unknown, curves = uncertain(self.of_model(natural), self.conditions)
         sigma = np.sqrt(natural[:, -1:] ** 2 + unknown[:, None] * (curves**2).sum(axis=1))
         z = (self.response - predicted) / sigma
@@ -386,7 +437,7 @@ def build_problem(
     check_varies(table, model.output)
     check_settings(table, model.conditions)
     problem, assumed = _set_up(model, table, priors)
-    _ = problem.serial  # refused here, not in the middle of an estimation
+    _ = problem.serial, problem.readings  # refused here, not in the middle of an estimation
     problem = problem.with_fixed(fixed) if fixed else problem
     if not problem.names:
         raise CalibError(
@@ -426,9 +477,15 @@ def _set_up(model: Model, table: Table, priors: Priors) -> tuple[Problem, dict[s
         f"{_with_unit(name, value)}; give it if yours differs"
         for name, value in assumed.items()
     ]
-    noise = noise_of(priors.noise, model.select(table.columns), priors.source)
+    noise = noise_of(priors.noise, model, table, priors.source)
     if model.uncertain is not None:
         noise.must_be_iid_normal(priors.source, f"the emulator {model.name}")
+    notes += [error.words() for error in noise.errors]
+    if noise.errors and noise.stated is None:
+        notes[-1] += (
+            "; if the column has something else, write errors = {} under [likelihood] in the prior "
+            "file, which leaves it out"
+        )
     return Problem(bound, table, priors, tuple(notes), noise), assumed
 
 
@@ -444,7 +501,10 @@ def problem_without_data(
     """
     model, table = get_model(model_name), as_table(at)
     table.must_have(*model.conditions)
-    problem, _ = _set_up(model, table, _priors_of(model, table, prior_path))
+    priors = _priors_of(model, table, prior_path)
+    # Conditions to predict at are known.
+    exact = replace(priors.noise, stated=(), set_points=())
+    problem, _ = _set_up(model, table, replace(priors, noise=exact))
     said = ", ".join(f"{n} {plain_number(v)}" for n, v in problem.bound.references.items())
     own = f"the parameters refer to the conditions that are predicted at: {said}"
     return replace(problem, notes=(*problem.notes, own) if said else problem.notes)

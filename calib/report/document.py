@@ -62,6 +62,7 @@ def _output(result: OutputResult) -> dict[str, Any]:
         },
         "references": dict(problem.bound.references),
         **_noise(problem.noise, result.preference),
+        **_condition_errors(problem.noise),
         **({"warnings": warnings} if warnings else {}),
         **summarise_estimates(result.estimates, result.by_pressure),
         "priors": {
@@ -91,6 +92,15 @@ def _noise(noise: Noise, preference: NoisePreference | None) -> dict[str, Any]:
             },
         }
     }
+
+
+def _condition_errors(noise: Noise) -> dict[str, Any]:
+    """What conditions are known with an error."""
+    found = {
+        e.name: {"sd": e.sd, "unit": e.column.unit, "kind": e.kind, "reliability": e.reliability}
+        for e in noise.errors
+    }
+    return {"condition_errors": found} if found else {}
 
 
 def summarise_estimates(

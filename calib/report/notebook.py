@@ -29,7 +29,7 @@ from calib.report.rows import Fitted
 from calib.report.verdict import verdict
 from calib.validation.comparison import Comparison
 from calib.validation.plan import NextTests
-from calib.validation.prediction import Prediction, band_columns, predictive_draws
+from calib.validation.prediction import Prediction, band_columns, row_draws
 from calib.validation.validate import Validation
 
 
@@ -141,7 +141,7 @@ def _(found: Imported) -> Figure:
 def _(found: Calibration) -> Figure:
     problem = found.problem
     rng = generator(found.seed, found.label, "replicate")
-    _, replicated = predictive_draws(found, problem.conditions, rng)
+    replicated = row_draws(found, problem.table, rng)
     with style.style(), units_of(problem.table.header):
         return bands.bands_figure(Fitted(found, None, replicated))
 

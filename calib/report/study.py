@@ -37,7 +37,7 @@ from calib.report.constants import MAX_ROWS
 from calib.report.labels import degrees, joined
 from calib.report.verdict import Evidence, gather
 from calib.validation.comparison import NoisePreference, noise_preference
-from calib.validation.prediction import predictive_draws, prior_predictive
+from calib.validation.prediction import prior_predictive, row_draws
 from calib.validation.scores import Sensitivity, prior_sensitivity
 from calib.validation.validate import Validation, leave_one_out, validate_held_out
 
@@ -377,9 +377,7 @@ def _work_out(
         calibration, loo=loo, progress=telling("with normal noise"), **how
     )
     seconds["validate"] = time.perf_counter() - clock
-    _, replicated = predictive_draws(
-        calibration, problem.conditions, generator(seed, output, "replicate")
-    )
+    replicated = row_draws(calibration, problem.table, generator(seed, output, "replicate"))
     expected = prior_predictive(problem, generator(seed, output, "prior"))
     found = validation, estimates, by_pressure, expected, replicated, seconds
     return OutputResult(task, calibration, *found, prior_sensitivity(calibration), preference)

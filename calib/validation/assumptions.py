@@ -224,7 +224,7 @@ def _contradicted(calibration: Calibration) -> Iterator[Check]:
         return
     mode = problem.theta(calibration.draws.mode[None])
     natural = np.concatenate([mode, problem.completed(best.theta, mode[0, -1])[None]])
-    raw = problem.residuals(natural) / problem.noise.scale(mode, problem.conditions)
+    raw = problem.residuals(natural) / problem.scale(mode)
     with_prior, without = np.square(raw).sum(axis=1)
     if not np.isfinite(without):
         return

@@ -27,7 +27,7 @@ from calib.errors import CalibError
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import estimate
 from calib.inference.io import save_calibration
-from calib.inference.likelihood import IID_NORMAL, Noise
+from calib.inference.likelihood import Noise
 from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
 from calib.inference.sampler import Progress, SamplerSettings
@@ -362,13 +362,12 @@ def noise_words(noise: Noise) -> str:
 
 
 def with_usual_noise(problem: Problem) -> Problem:
-    """Return a problem with normal noise of one standard deviation, and the same other priors."""
+    """Return a problem with normal noise of one standard deviation, and all else the same."""
     left_out = problem.noise.parameters
     kept = tuple(p for p in problem.priors.entries if p.name not in left_out)
-    return replace(
-        problem, noise=IID_NORMAL,
-        priors=replace(problem.priors, entries=kept, noise=IID_NORMAL),
-    )  # fmt: skip
+    usual = problem.noise.of_errors
+    priors = replace(problem.priors, entries=kept, noise=replace(usual, errors=()))
+    return replace(problem, noise=usual, priors=priors)
 
 
 def noise_preference(
@@ -389,7 +388,7 @@ def noise_preference(
     Vehtari, Gelman & Gabry (2017), doi:10.1007/s11222-016-9696-4.
     """
     problem = calibration.problem
-    if problem.noise.iid_normal:
+    if not problem.noise.parameters:
         return None
     usual = calibrate(
         with_usual_noise(problem), calibration.seed, label=f"{calibration.label} normal noise",

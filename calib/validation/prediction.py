@@ -215,7 +215,8 @@ class Prediction(Shown):
                     # All that has a logarithm is above zero.
                     least = (bound.model.response == "log") & (limit[some] <= 0.0)
                     left = np.where(least, -np.inf, bound.to_response(limit[some])) - location
-                z = part.problem.noise.normal_scores(left, part.natural, at)
+                noise = part.problem.noise
+                z = noise.normal_scores(left, part.natural, noise.scale(part.natural, at))
                 values[0].append(np.where(np.isnan(left), np.nan, (left < 0.0) == over))
                 values[1].append(ndtr(-z if over else z))
             both = [np.concatenate(v) for v in values]
@@ -345,6 +346,15 @@ def predictive_draws(
     noise = problem.noise.draw(natural, conditions, rng, location.shape[1])
     from_response = problem.bound.from_response
     return from_response(location), from_response(location + noise)
+
+
+@one_thread()
+def row_draws(calibration: Calibration, table: Table, rng: np.random.Generator) -> Array:
+    """Draw readings of the rows of a table, errors of their conditions included, (size, n)."""
+    problem = calibration.problem.with_table(table)
+    natural = problem.theta(calibration.subset(N_DRAWS))
+    location = problem.draw_mean_response(natural, problem.conditions, rng)
+    return problem.bound.from_response(location + problem.draw_noise(natural, rng, apart=True))
 
 
 def prior_predictive(problem: Problem, rng: np.random.Generator) -> Array:

@@ -98,7 +98,7 @@ def linear(problem: Problem, t: Array, used: NDArray[np.bool_]) -> tuple[Array, 
     steps = 1e-5 * np.maximum(np.abs(t), 1.0)
     moved = np.concatenate([t[None], t + np.diag(steps), t - np.diag(steps)])
     natural = problem.theta(moved)
-    relative = problem.noise.scale(natural[:1], problem.conditions) / natural[0, -1]
+    relative = problem.scale(natural[:1]) / natural[0, -1]
     residuals = problem.residuals(natural) / relative
     # One-sided beside ground where the model has no value, as at the edge of an emulator.
     ends = residuals[1:].reshape(2, t.size, -1)
@@ -124,7 +124,7 @@ def residual_checks(problem: Problem, t: Array) -> tuple[Check, ...]:
         return ()
     natural = problem.theta(t[None])
     raw = problem.residuals(natural)
-    score = problem.noise.normal_scores(raw, natural, problem.conditions)[0]
+    score = problem.noise.normal_scores(raw, natural, problem.scale(natural))[0]
     leverage = np.sum(design**2, axis=1)
     if problem.serial is not None:
         mean, variance = problem.serial.before(score[None], problem.noise.own("rho", natural))

@@ -249,10 +249,10 @@ def standardise(calibration: Calibration, problem: Problem) -> Standardised:
     """Work residuals out at the posterior: of the problem's rows, calibrated on or others."""
     natural = problem.theta(calibration.subset(1000))
     location = problem.bound.mean_response(problem.of_model(natural), problem.conditions)
-    residual = np.nanmean(
-        problem.noise.normal_scores(problem.response - location, natural, problem.conditions),
-        axis=0,
+    scores = problem.noise.normal_scores(
+        problem.residuals(natural), natural, problem.scale(natural)
     )
+    residual = np.nanmean(scores, axis=0)
     return Standardised(residual, problem.bound.from_response(np.nanmedian(location, axis=0)))
 
 

@@ -29,7 +29,7 @@ from calib.inference.sampler import Progress, SamplerSettings, sample_posterior
 from calib.models.base import Array
 from calib.shown import Shown
 from calib.validation.constants import LEVELS, N_DRAWS, PARETO_K_MAX, RELATIVE_ERROR_FAR
-from calib.validation.prediction import predictive_draws
+from calib.validation.prediction import row_draws
 from calib.validation.scores import Scores, crps, score
 
 
@@ -119,7 +119,7 @@ def validate_held_out(calibration: Calibration, held_out: Tabular) -> Validation
     check_conditions(held_out, {n: v for n, v in known.items() if n in held_out})
     check_unseen(fitted.table, held_out, (*fitted.conditions, model.output))
     rng = generator(calibration.seed, calibration.label, "validate")
-    _, draws = predictive_draws(calibration, model.select(held_out.columns), rng)
+    draws = row_draws(calibration, held_out, rng)
     draws = draws[np.isfinite(draws).all(axis=1)]
     if not draws.size:
         raise CalibError(
@@ -210,9 +210,9 @@ def leave_one_out(
             elpd[i] = _log_mean(np.where(defined, held, -np.inf), np.zeros_like(held))
             sample = sample[np.resize(np.flatnonzero(defined), N_DRAWS)]
         natural = problem.theta(sample)
-        here = problem.bound.model.select(row.columns)
-        location = problem.draw_mean_response(natural, here, rng)
-        noisy = location + problem.noise.draw(natural, here, rng, 1)
+        here = problem.with_table(row)
+        location = here.draw_mean_response(natural, here.conditions, rng)
+        noisy = location + here.draw_noise(natural, rng, apart=True)
         drawn[:, i] = problem.bound.from_response(noisy)[:, 0]
     if progress is not None and not refits:
         progress(n, n)

@@ -122,8 +122,9 @@ def test_noise_is_drawn_as_its_density_says() -> None:
         assert stats.kstest(found[:, i], law.cdf).pvalue > 1e-3
         np.testing.assert_allclose(law.cdf(at_quantiles[:, i]), stats.norm.cdf(z[:, 0]), rtol=1e-8)
     np.testing.assert_allclose(
-        noise.normal_scores(at_quantiles, natural, conditions), np.tile(z, (1, 3)), rtol=1e-8
-    )
+        noise.normal_scores(at_quantiles, natural, noise.scale(natural, conditions)),
+        np.tile(z, (1, 3)), rtol=1e-8,
+    )  # fmt: skip
 
 
 def off_line(factor: float) -> Table:

@@ -177,9 +177,7 @@ def test_beyond_the_range_vectors_without_a_value_are_left_out(
 def test_no_value_at_all_is_told(
     pull_calibration: Calibration, pull_tables: tuple[Table, Table], monkeypatch
 ) -> None:
-    monkeypatch.setattr(
-        validate_module, "predictive_draws", lambda *a: (None, np.full((4000, 14), np.nan))
-    )
+    monkeypatch.setattr(validate_module, "row_draws", lambda *a: np.full((4000, 14), np.nan))
     with pytest.raises(CalibError, match="has no value at the held-out rows") as caught:
         validate_held_out(pull_calibration, pull_tables[1])
     assert "he2019 drawbar_pull" in str(caught.value)
