@@ -390,8 +390,9 @@ def _checked(
     n, truths = len(b.weight), b.truths(SIMULATED, rng)
     flat, scale = b.readings.reshape(n, -1), b.scale.reshape(n, -1)
     read = flat[truths] + scale[truths] * b.noise.draw(b.own[truths], {}, rng, flat.shape[1])
+    one = b.noise.scale(b.own, {})
     ln = np.log(b.weight) - np.log(scale).sum(axis=1) + np.stack(
-        [b.noise.log_density((y - flat) / scale, b.own, b.noise.scale(b.own, {})).sum(axis=1) for y in read]
+        [b.noise.log_density((y - flat) / scale, b.own, one).sum(axis=1) for y in read]
     )  # fmt: skip
     others = np.arange(n) != truths[:, None]
     raw, weight = ln[others].reshape(SIMULATED, -1), np.zeros_like(ln)
