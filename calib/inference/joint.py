@@ -154,6 +154,21 @@ class JointProblem:
         """Names of the coordinates that are sampled."""
         return (*self.priors.names, *(f"{p}[{g}]" for g in self.groups for p in self.pooled))
 
+    def with_models(self, models: Sequence[Model]) -> JointProblem:
+        """Return the problem with other models in the place of those of their names: emulators."""
+        named, parts = {model.name: model for model in models}, {}
+        for key, part in self.parts.items():
+            bound = part.problem.bound
+            model = named.get(bound.model.name, bound.model)
+            own = replace(part.problem, bound=replace(bound, model=model))
+            parts[key] = replace(part, problem=own)
+        return replace(self, parts=parts)
+
+    def whole(self, output: str) -> Problem:
+        """Return the problem of an output, with the rows of all groups."""
+        own = [part.problem for (name, _), part in self.parts.items() if name == output]
+        return own[0].with_table(_stacked([p.table for p in own])) if self.groups else own[0]
+
     @cached_property
     def _places(self) -> tuple[Array, Array]:
         """Places of means and of sds between groups, each (q,)."""
@@ -497,8 +512,7 @@ class JointCalibration:
         label = f"{output} {group or ''}".strip()
         if group is None and self.problem.groups:
             theta = self._new(h)[:, None]
-            tables = [self.problem.parts[key].problem.table for key in keys]
-            part = replace(part, problem=part.problem.with_table(_stacked(tables)), group=0)
+            part = replace(part, problem=self.problem.whole(output), group=0)
             label = f"{output} of a new group"
         t = part.coordinates(h, theta).reshape(*self.draws.t.shape[:3], -1)
         report = judge(
