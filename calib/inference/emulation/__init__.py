@@ -132,7 +132,8 @@ def extend(
     """Make runs where another problem of the same simulator needs them, a field campaign's.
 
     It has the same model and priors. Where the emulator, which serves the calibration, is good it
-    stays so. The emulation's runs are the new ones, `more` at the most.
+    stays so. The emulation's runs are the new ones, `more` at the most, and none where the other
+    problem's posterior lies within that for which the emulator was found good.
     """
     state = State.beyond(emulator, problem, keeper, seed, more, progress)
     (found,) = _improved(state, settings or EmulationSettings(), more)
@@ -143,7 +144,9 @@ def _improved(state: State, chosen: EmulationSettings, most: int) -> tuple[Emula
     """Make runs where the posterior needs them, then some to check the emulator on."""
     history: list[tuple[int, float]] = []
     checks = chosen.checks_of(most)
-    state.sample(0)
+    z = state.sample(0)
+    if state.serves(z) and state.error(z) <= 0.8 * chosen.tolerance:
+        return judged(state, z, chosen, [None] * len(state.outputs), [(0, state.error(z))])
     while True:
         z = _needed(state, chosen, checks, history)
         # Runs that failed across zero and were made again may have taken some of them.
@@ -379,7 +382,7 @@ def _judged(
     state: State, known: Known, z: Array, chosen: EmulationSettings, measured: HeldOut | None,
     history: Sequence[tuple[int, float]],
 ) -> Emulation:  # fmt: skip
-    expected, between = known.error(z), _between(known, z)
+    expected, (between, at_rows) = known.error(z), _between(known, z)
     wider, shifted = _consequences(state, known, z, measured)
     reasons = []
     off = measured.rmse if measured is not None else expected
@@ -397,11 +400,12 @@ def _judged(
         reasons.append(
             f"its 90 % intervals hold {100 * measured.covered:.0f} % of the runs it had not seen"
         )
-    if between > chosen.tolerance and not _has_all_rows(known):
+    if at_rows > chosen.tolerance:
         reasons.append(
-            f"between its nodes it is off by {between:.2f} noise sds (rms), where "
-            f"{chosen.tolerance:g} are allowed, and rows of the data lie there: give it more nodes"
+            f"between its nodes, where rows of the data lie, it is off by {at_rows:.2f} noise sds "
+            f"(rms), where {chosen.tolerance:g} are allowed: give it more nodes"
         )
+    known.use(replace(known.emulator, good=not reasons))
     return Emulation(
         known.emulated, known.emulator, tuple(state.runs), measured, expected, between,
         known.own_noise, not reasons, tuple(reasons), tuple(history), bool(state.earlier), wider,
@@ -455,26 +459,23 @@ def _moves(known: Known, z: Array, moved: Array) -> bool:
     return bool(np.nanmax(rms) >= NEGLIGIBLE * known.sigma)
 
 
-def _between(known: Known, z: Array) -> float:
-    """Rms error at conditions between the nodes, in sds of the noise."""
-    over = known.emulator.over
-    left_out = over.left_out(np.concatenate([known.emulator.mean[None], known.emulator.curves]))
+def _between(known: Known, z: Array) -> tuple[float, float]:
+    """Rms errors between the nodes and at the rows of the data, in sds of the noise.
+
+    What interpolation leaves unknown at a row is in units of what it leaves at nodes that are left
+    out, whose errors are known.
+    """
+    emulator, over = known.emulator, known.emulator.over
+    left_out, unknown = over.left_out(np.concatenate([emulator.mean[None], emulator.curves]))
     # At the ends of the box a node that is left out has none beyond it.
-    left_out = left_out[:, ((over.nodes > 0.0) & (over.nodes < 1.0)).all(axis=1)]
-    theta = known.axes.natural(z[known.emulator.holds(z)][:64])
-    c = np.concatenate([np.ones((len(theta), 1)), known.emulator.coefficients(theta)], axis=1)
-    squares = np.square(c @ left_out)
-    return float(np.sqrt(np.nanmean(squares))) / known.sigma if squares.size else 0.0
-
-
-def _has_all_rows(known: Known) -> bool:
-    """Whether every row of the data is a node."""
-    at = known.training.nodes
-    nodes = np.stack([*at.values()], axis=1)
-    rows = np.stack([known.problem.conditions[name] for name in at], axis=1)
-    scale = np.maximum(np.abs(nodes).max(axis=0), 1e-300)
-    apart = np.abs(rows[:, None] - nodes) / scale
-    return bool((apart.max(axis=2).min(axis=1) < 1e-6).all())
+    inner = ((over.nodes > 0.0) & (over.nodes < 1.0)).all(axis=1)
+    theta = known.axes.natural(z[emulator.holds(z)][:64])
+    c = np.concatenate([np.ones((len(theta), 1)), emulator.coefficients(theta)], axis=1)
+    squares = np.square(c @ left_out[:, inner])
+    if not squares.size:
+        return 0.0, 0.0
+    at_rows = over.unknown(known.problem.conditions).mean() * (squares / unknown[inner]).mean()
+    return float(np.sqrt(squares.mean())) / known.sigma, float(np.sqrt(at_rows)) / known.sigma
 
 
 def _consequences(

@@ -447,6 +447,14 @@ class State:
         """The largest error that an emulator expects at draws, see `Known.error`."""
         return max(known.error(z) for known in self.outputs)
 
+    def serves(self, z: Array) -> bool:
+        """Whether nearly all draws lie where an emulator that is there was found good."""
+        inside = np.zeros(len(z), dtype=bool)
+        for region in self.earlier:
+            inside |= region.inside(z)
+        good = bool(self.earlier) and self.emulator.good and self.emulator.support is None
+        return good and bool(inside.mean() > 0.95)
+
     def lost(self, z: Array) -> bool:
         """Whether to most draws a run that failed is closer than any other: no value is known."""
         if self.region is None:
