@@ -223,8 +223,9 @@ def _nodes(
     Return with them which of them lie across zero, and the run that told, if one was made.
     """
     ranges = keeper.simulator.ranges
-    inside = choose_nodes(recorded, ranges, count)
-    wide = choose_nodes(recorded, ranges, count, across_zero=True)
+    along = keeper.simulator.series_along
+    inside = choose_nodes(recorded, ranges, count, along=along)
+    wide = choose_nodes(recorded, ranges, count, across_zero=True, along=along)
     if all(np.array_equal(inside[name], wide[name]) for name in inside):
         return inside, None, ()
     tried = tuple(keeper.runs(prior_middle(problem), wide))

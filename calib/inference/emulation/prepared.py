@@ -227,7 +227,7 @@ def emulated(
     >>> emulation = calib.emulated(calib.build_problem("wheel", data), seed=1)  # doctest: +SKIP
     >>> calibration = calib.calibrate(emulation.problem, seed=1)  # doctest: +SKIP
     """
-    problem.noise.must_be_iid_normal(problem.priors.source, "an emulator")
+    problem.noise.must_be_normal_of_one_sd(problem.priors.source, "an emulator")
     found = _simulated(problem.bound.model.name)
     settings = found.emulation
     if isinstance(found.simulator.runner, TableRunner):
@@ -285,9 +285,10 @@ def emulated_jointly(
         waiting -= {*outputs}  # another simulator cannot be asked before it is emulated
         known = replace(joint, parts={k: p for k, p in joint.parts.items() if k[0] not in waiting})
         problems = [joint.whole(output) for output in outputs]
-        held = [[(p.name, p.fixed, p.loc) for p in q.priors.entries[:-1]] for q in problems]
+        d = len(problems[0].bound.model.parameters)
+        held = [[(p.name, p.fixed, p.loc) for p in q.priors.entries[:d]] for q in problems]
         for problem in problems:
-            problem.noise.must_be_iid_normal(problem.priors.source, "an emulator")
+            problem.noise.must_be_normal_of_one_sd(problem.priors.source, "an emulator")
         if any(one != held[0] for one in held):
             raise CalibError(
                 f"the priors of {', '.join(outputs)} differ", where=f"simulator {name}",

@@ -17,6 +17,7 @@ from calib.inference.constants import NEGLIGIBLE
 from calib.inference.design import across_zero
 from calib.inference.joint import JointProblem, calibrate_joint
 from calib.inference.mode import prior_widths
+from calib.inference.priors import Prior
 from calib.inference.problem import Problem
 from calib.inference.random import generator, stream
 from calib.inference.sampler import SamplerSettings, sample_posterior
@@ -275,7 +276,7 @@ class State:
         self.keeper, self.nodes, self.joint = keeper, nodes, joint
         self.seed, self.most, self.label, self.progress = seed, most, label, progress
         self.axes = _axes(problems[0])
-        self.free = np.array([not p.fixed for p in problems[0].priors.entries[:-1]])
+        self.free = np.array([not p.fixed for p in _entries(problems[0])])
         n = next(iter(nodes.values())).size
         self.across = np.zeros(n, dtype=bool) if across is None else across
         self.outputs = tuple(Known(p, self.axes, nodes, self.across) for p in problems)
@@ -418,7 +419,7 @@ class State:
         self.mode = draws.mode
         natural = known.emulated.theta(_some(draws.flat))
         known.sigma = float(np.median(natural[:, -1]))
-        return self.axes.of(natural[:, :-1])
+        return self.axes.of(known.problem.of_model(natural))
 
     def _drawn_jointly(self, step: int, tell: Callable[[int, int], None]) -> Array:
         """Draw from the joint posterior: parameters of all groups, where there are groups."""
@@ -435,7 +436,7 @@ class State:
                 part = found.calibration(output, group or None)
                 natural = part.problem.theta(_some(part.draws.flat))
                 sigmas.append(float(np.median(natural[:, -1])))
-                of_group.setdefault(group, self.axes.of(natural[:, :-1]))
+                of_group.setdefault(group, self.axes.of(known.problem.of_model(natural)))
             known.sigma = min(sigmas)
         return _some(np.concatenate([*of_group.values()]))
 
@@ -482,8 +483,13 @@ def across_too(run: Run) -> Run:
     return replace(run, failure=replace(run.failure, reason=reason))
 
 
+def _entries(problem: Problem) -> tuple[Prior, ...]:
+    """Priors of the simulator's parameters."""
+    return problem.priors.entries[: len(problem.bound.model.parameters)]
+
+
 def _axes(problem: Problem) -> Axes:
-    entries = problem.priors.entries[:-1]
+    entries = _entries(problem)
     free = np.array([not p.fixed for p in entries])
     width = np.ones(len(entries))
     width[free] = prior_widths(problem.priors)[: int(free.sum())]
