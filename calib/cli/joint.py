@@ -11,7 +11,7 @@ import typer
 
 from calib.cli import options as opt
 from calib.cli.calibration import tell_verdict
-from calib.cli.options import emulate, finish, progress_bars
+from calib.cli.options import emulate_jointly, finish, progress_bars
 from calib.errors import CalibError
 
 if TYPE_CHECKING:
@@ -84,8 +84,9 @@ def joint(
         left = {m: len(held[m]) if m in held else 0 for m in model}
         opt.planned(problem.wholes.values(), left, out)
         return
-    emulations = emulate({m: (t, given.get(m)) for m, t in fitted.items()}, seed, workers, [])
     problem = build(fitted)
+    if emulations := emulate_jointly(problem, seed, workers, [*held.values()]):
+        problem = build(fitted)
     with progress_bars() as tell:
         found = calibrate_joint(
             problem, seed, settings=SamplerSettings(max_steps=max_steps),

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from calib.data import Table
     from calib.inference.emulation import Emulation
+    from calib.inference.joint import JointProblem
     from calib.inference.problem import Problem
 
 type Tell = Callable[[str, int, int], None]
@@ -312,7 +313,25 @@ def emulate(
             )
             for name, (table, path) in models.items()
         }
-    emulations = {name: emulation for name, emulation in found.items() if emulation is not None}
+    return _said({name: emulation for name, emulation in found.items() if emulation is not None})
+
+
+def emulate_jointly(
+    joint: JointProblem, seed: int, workers: int, elsewhere: Iterable[Table | None] = ()
+) -> dict[str, Emulation]:
+    """Emulate the slow simulators of a joint problem, to be built again, and say how good each is.
+
+    Emulations by model; `elsewhere` it is to predict too.
+    """
+    from calib.inference.emulation.prepared import prepare_joint
+
+    others = [table for table in elsewhere if table is not None]
+    with progress_bars() as tell:
+        found = prepare_joint(joint, seed, elsewhere=others, workers=workers, progress=tell)
+    return _said(found)
+
+
+def _said(emulations: dict[str, Emulation]) -> dict[str, Emulation]:
     for name, emulation in emulations.items():
         say(name, emulation)
     return emulations

@@ -186,6 +186,7 @@ def choose_nodes(
     count: int | None = None,
     *,
     across_zero: bool = False,
+    along: str = "",
 ) -> dict[str, Array]:
     """Choose the conditions of every run: the distinct recorded ones, then others between them.
 
@@ -201,7 +202,22 @@ def choose_nodes(
     across_zero : bool
         Whether the margin may change a condition's sign, as a slip's does with another rolling
         radius: many formulas and some simulators end there.
+    along : str
+        A condition of which series are given: `count` is then of series, which all have the same
+        values of it, as many of those recorded as leave some 600 nodes.
     """
+    if along:
+        own = np.concatenate([r[along] for r in recorded])
+        others = [{c: v for c, v in r.items() if c != along} for r in recorded]
+        settings = {"": np.zeros(1)}
+        if others[0]:
+            settings = choose_nodes(others, ranges, count, across_zero=across_zero)
+        series = next(iter(settings.values())).size
+        most = min(max(600 // series, 8), np.unique(own).size)
+        span = {along: ranges.get(along, (float(own.min()), float(own.max())))}
+        each = choose_nodes([{along: own}], span, most)[along]
+        nodes = {c: np.repeat(v, each.size) for c, v in settings.items() if c}
+        return {c: nodes.get(c, np.tile(each, series)) for c in recorded[0]}
     columns = tuple(recorded[0])
     rows = np.concatenate([np.stack([r[c] for c in columns], axis=1) for r in recorded])
     rows = np.unique(rows, axis=0)

@@ -27,7 +27,7 @@ density is exact, with the Jacobian |L_g|.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from numbers import Integral
@@ -169,6 +169,24 @@ class JointProblem:
     def names(self) -> tuple[str, ...]:
         """Names of the coordinates that are sampled."""
         return (*self.priors.names, *(f"{p}[{g}]" for g in self.groups for p in self.pooled))
+
+    def without(self, outputs: Collection[str]) -> JointProblem:
+        """Return the problem without some outputs, whose parameters stay."""
+        parts = {k: p for k, p in self.parts.items() if k[0] not in outputs}
+        wholes = {k: w for k, w in self.wholes.items() if k not in outputs}
+        return replace(self, parts=parts, wholes=wholes)
+
+    def with_models(self, models: Sequence[Model]) -> JointProblem:
+        """Return the problem with other models in the place of those of their names: emulators."""
+        named = {model.name: model for model in models}
+
+        def with_its(problem: Problem) -> Problem:
+            model = named.get(problem.bound.model.name, problem.bound.model)
+            return replace(problem, bound=replace(problem.bound, model=model))
+
+        parts = {k: replace(p, problem=with_its(p.problem)) for k, p in self.parts.items()}
+        wholes = {k: with_its(whole) for k, whole in self.wholes.items()}
+        return replace(self, parts=parts, wholes=wholes)
 
     @cached_property
     def _places(self) -> tuple[Array, Array]:

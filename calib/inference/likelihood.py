@@ -122,6 +122,23 @@ def log_normal(residuals: Array, variance: Array, curves: Array, sigma: Array) -
     return np.where(bad, np.nan, value)
 
 
+def log_normal_of_each(residuals: Array, variance: Array, curves: Array, sigma: Array) -> Array:
+    """Evaluate the same where curves (k, n, j) are of each vector's own."""
+    squares = np.square(residuals).sum(axis=1) / sigma**2
+    ratio = variance / sigma**2
+    taken = np.einsum("knj,kn->kj", curves, residuals)
+    grown = np.eye(curves.shape[2]) + ratio[:, None, None] * np.einsum(
+        "kni,knj->kij", curves, curves
+    )
+    bad = ~(np.isfinite(grown).all(axis=(1, 2)) & np.isfinite(squares) & (sigma > 0.0))
+    grown[bad] = np.eye(curves.shape[2])
+    solved = np.linalg.solve(grown, taken[..., None])[..., 0]
+    squares -= ratio / sigma**2 * (taken * solved).sum(axis=1)
+    value = -residuals.shape[1] * (np.log(sigma) + HALF_LN_2PI)
+    value -= 0.5 * (np.linalg.slogdet(grown)[1] + squares)
+    return np.where(bad, np.nan, value)
+
+
 type Family = Literal["normal", "student_t"]
 type Along = Literal["", "run_order"]
 
@@ -210,10 +227,12 @@ class Noise:
                 "again what was fitted with it",
             )
 
-    def must_be_normal_of_one_sd(self, source: str) -> None:
-        """Raise a CalibError unless it is, for a diagnosis, but for correlation and errors."""
-        plain = replace(self, correlated_along="", errors=())
-        plain.must_be_iid_normal(source, "a diagnosis")
+    def must_be_normal_of_one_sd(
+        self, source: str, what: str = "a diagnosis", *, errors: bool = True
+    ) -> None:
+        """Raise a CalibError unless it is, but for correlation and, if they may be, errors."""
+        plain = replace(self, correlated_along="", errors=() if errors else self.errors)
+        plain.must_be_iid_normal(source, what)
 
     def scale(self, natural: Array, conditions: Mapping[str, Array]) -> Array:
         """Return the scale at conditions: natural parameters (k, d_all) to (k, 1) or (k, n)."""
@@ -355,6 +374,11 @@ class Serial:
         mean = np.zeros_like(along)
         mean[:, 1:] = r[:, 1:] * along[:, :-1]
         return self._back(mean), self._back(1.0 - r * r)
+
+    def whitened(self, z: Array, rho: Array) -> tuple[Array, Array]:
+        """Noise (k, n) as if it were independent, and the log of the sds that it is divided by."""
+        mean, variance = self.before(z, rho)
+        return (z - mean) / np.sqrt(variance), 0.5 * np.log(variance)
 
     def given_all_others(self, z: Array, rho: Array) -> tuple[Array, Array]:
         """Mean and variance of each row given all others, (k, n), in the rows' order."""

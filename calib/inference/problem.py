@@ -41,6 +41,7 @@ from calib.inference.likelihood import (
     SumOfSquares,
     in_chunks,
     log_normal,
+    log_normal_of_each,
     noise_of,
     serial_of,
 )
@@ -298,7 +299,11 @@ class Problem:
                 predicted, unknown, curves = model.uncertain(
                     self.of_model(natural), self.conditions
                 )
-                value = log_normal(self.response - predicted, unknown, curves, sigma)
+                off = self.response - predicted
+                if self.serial is None:
+                    value = log_normal(off, unknown, curves, sigma)
+                else:
+                    value = self._log_serial(self.serial, off, unknown, curves, natural)
             elif self.noise.iid_normal:
                 sse = (
                     self.squares(self.of_model(natural))
@@ -316,6 +321,18 @@ class Problem:
                 )
         value += self._ln_jacobian.sum()
         return np.where(np.isfinite(value), value, -np.inf)
+
+    def _log_serial(
+        self, serial: Serial, off: Array, unknown: Array, curves: Array, natural: Array
+    ) -> Array:
+        """Log likelihood of an emulator's residuals (k, n) where the noise is correlated, (k,)."""
+        rho, value = self.noise.own("rho", natural), np.empty(len(off))
+        for i in np.array_split(np.arange(len(off)), 1 + off.size * (1 + curves.shape[1]) // 10**6):
+            z, ln_sd = serial.whitened(off[i], rho[i])
+            own = [serial.whitened(np.tile(c, (i.size, 1)), rho[i])[0] for c in curves.T]
+            value[i] = log_normal_of_each(z, unknown[i], np.stack(own, axis=2), natural[i, -1])
+            value[i] -= ln_sd.sum(axis=1)
+        return value
 
     def _log_densities(self, natural: Array, given: _Given) -> Array:
         """Log density of the noise of every row given others, where it is correlated, (k, n)."""
@@ -479,7 +496,8 @@ def _set_up(model: Model, table: Table, priors: Priors) -> tuple[Problem, dict[s
     ]
     noise = noise_of(priors.noise, model, table, priors.source)
     if model.uncertain is not None:
-        noise.must_be_iid_normal(priors.source, f"the emulator {model.name}")
+        what = f"the emulator {model.name}"
+        noise.must_be_normal_of_one_sd(priors.source, what, errors=False)
     notes += [error.words() for error in noise.errors]
     if noise.errors and noise.stated is None:
         notes[-1] += (

@@ -20,8 +20,16 @@ from calib.data.quantities import real_array
 from calib.data.table import parse_header
 from calib.errors import CalibError
 from calib.inference.design import check_moves, check_scale
-from calib.inference.emulation import emulate, extend, judged, left_out
-from calib.inference.emulation.state import Emulation, Progress, State
+from calib.inference.emulation import (
+    check_outputs,
+    emulate,
+    emulate_together,
+    extend,
+    judged,
+    left_out,
+)
+from calib.inference.emulation.state import Emulation, Progress, State, has_value
+from calib.inference.joint import JointProblem
 from calib.inference.prior_files import PriorFile
 from calib.inference.problem import Problem, build_problem
 from calib.models import get_model
@@ -40,27 +48,28 @@ from calib.models.simulators.simulator import FAILED, Failure, Run, RunKeeper, S
 
 
 def emulate_table(
-    problem: Problem, simulator: Simulator, seed: int, settings: EmulationSettings,
-    progress: Progress | None = None,
-) -> Emulation:  # fmt: skip
+    problems: Sequence[Problem], simulator: Simulator, seed: int, settings: EmulationSettings,
+    progress: Progress | None = None, joint: JointProblem | None = None,
+) -> tuple[Emulation, ...]:  # fmt: skip
     """Emulate from a table; each run where the posterior is checks what the others say of it."""
-    training = read_runs(simulator, problem)
-    state = State(problem, RunKeeper(simulator), training.nodes, seed, progress=progress)
-    state.runs = [
-        Run(t, {problem.bound.model.output: v})
-        if np.isfinite(v).all()
-        else Run(t, {}, Failure("nan", "the table has no value for it"))
-        for t, v in zip(training.theta, training.values, strict=True)
-    ]
-    check_scale(problem, state.outputs(training.values), simulator)
-    check_moves(problem, state.outputs(training.values), simulator)
-    state.learn(training.theta, training.values)
+    read = [read_runs(simulator, problem) for problem in problems]
+    theta, nodes = read[0].theta, read[0].nodes
+    state = State(
+        problems, RunKeeper(simulator), nodes, seed, progress=progress, joint=joint
+    )  # fmt: skip
+    values = np.stack([training.values for training in read], axis=1)
+    ok = has_value(values)
+    values[~ok] = np.nan
+    lacks = Failure("nan", "the table has no value for it")
+    state.runs = [Run(t, {}, None if good else lacks) for t, good in zip(theta, ok, strict=True)]
+    check_outputs(state, values, check_scale, check_moves)
+    state.learn(theta, values)
     for step in range(2):
         state.rebuild()
         z = state.sample(step)
     state.rebuild()
-    history = [(len(training.theta), state.error(z))]
-    return judged(state, z, settings, left_out(state), history)
+    history = [(len(theta), state.error(z))]
+    return judged(state, z, settings, [left_out(known) for known in state.outputs], history)
 
 
 def read_runs(simulator: Simulator, problem: Problem) -> Training:
@@ -217,16 +226,89 @@ def emulated(
     >>> emulation = calib.emulated(calib.build_problem("wheel", data), seed=1)  # doctest: +SKIP
     >>> calibration = calib.calibrate(emulation.problem, seed=1)  # doctest: +SKIP
     """
-    problem.noise.must_be_iid_normal(problem.priors.source, "an emulator")
+    problem.noise.must_be_normal_of_one_sd(problem.priors.source, "an emulator", errors=False)
     found = _simulated(problem.bound.model.name)
     settings = found.emulation
     if isinstance(found.simulator.runner, TableRunner):
-        return emulate_table(problem, found.simulator, seed, settings, progress)
+        return emulate_table([problem], found.simulator, seed, settings, progress)[0]
     keeper = _keeper(found, workers, scheduler, progress, settings.runs)
     return emulate(
         problem, keeper, seed, settings=settings, elsewhere=[t.columns for t in elsewhere],
         progress=progress,
     )  # fmt: skip
+
+
+def emulated_jointly(
+    joint: JointProblem,
+    seed: int,
+    *,
+    elsewhere: Sequence[Table] = (),
+    workers: int = 1,
+    progress: Progress | None = None,
+) -> tuple[JointProblem, dict[str, Emulation]]:
+    """Emulate the slow simulators behind a joint problem, each once for all of its outputs.
+
+    Parameters
+    ----------
+    elsewhere : sequence of Table
+        Whose conditions will be predicted beside those of the problem.
+    progress : callable, optional
+        Called with what is done, how much of it, and of how much.
+
+    Returns
+    -------
+    joint : JointProblem
+        With emulators in the place of the simulators: it can be calibrated.
+    emulations : dict of str to Emulation
+        By model; those of one simulator stand on the same runs.
+
+    Raises
+    ------
+    CalibError
+        As of `emulated`; if outputs of one simulator have priors that differ.
+
+    Examples
+    --------
+    >>> from calib.inference.joint import build_joint, calibrate_joint
+    >>> joint = build_joint({"wheel_drawbar_pull": data, "wheel_rut_depth": data})  # doctest: +SKIP
+    >>> joint, emulations = emulated_jointly(joint, seed=1)  # doctest: +SKIP
+    >>> found = calibrate_joint(joint, seed=1)  # doctest: +SKIP
+    """
+    by_simulator: dict[str, list[str]] = {}
+    for output, model in zip(joint.outputs, joint.models, strict=True):
+        if model.uncertain is None and (slow := slow_simulator(model.name)) is not None:
+            by_simulator.setdefault(slow.name, []).append(output)
+    waiting = {o for outputs in by_simulator.values() for o in outputs}
+    emulations: dict[str, Emulation] = {}
+    for name, outputs in by_simulator.items():
+        waiting -= {*outputs}  # another simulator cannot be asked before it is emulated
+        known = joint.without(waiting)
+        problems = [joint.wholes[output] for output in outputs]
+        d = len(problems[0].bound.model.parameters)
+        held = [[(p.name, p.fixed, p.loc) for p in q.priors.entries[:d]] for q in problems]
+        for problem in problems:
+            problem.noise.must_be_normal_of_one_sd(
+                problem.priors.source, "an emulator", errors=False
+            )
+        if any(one != held[0] for one in held):
+            raise CalibError(
+                f"the priors of {', '.join(outputs)} differ", where=f"simulator {name}",
+                expected="the same for all outputs, which come from the same runs",
+                hint="give the models prior files that agree in all but sigma",
+            )  # fmt: skip
+        simulated = SIMULATED[name]
+        settings = simulated.emulation
+        if isinstance(simulated.simulator.runner, TableRunner):
+            found = emulate_table(problems, simulated.simulator, seed, settings, progress, known)
+        else:
+            keeper = _keeper(simulated, workers, None, progress, settings.runs)
+            found = emulate_together(
+                problems, keeper, seed, joint=known, settings=settings, progress=progress,
+                elsewhere=[t.columns for t in elsewhere],
+            )  # fmt: skip
+        joint = joint.with_models([e.problem.bound.model for e in found])
+        emulations |= {e.problem.bound.model.name: e for e in found}
+    return joint, emulations
 
 
 def _simulated(model: str) -> Simulated:
@@ -284,6 +366,25 @@ def prepare(
     )  # fmt: skip
     load_files([_kept(found, model, emulation)])
     return emulation
+
+
+def prepare_joint(
+    joint: JointProblem,
+    seed: int,
+    *,
+    elsewhere: Sequence[Table] = (),
+    workers: int = 1,
+    progress: Progress | None = None,
+) -> dict[str, Emulation]:
+    """Emulate the slow simulators of a joint problem, for all that this process does from now on.
+
+    The same problem built again has the emulators. Nothing is returned of quick models.
+    """
+    _, emulations = emulated_jointly(
+        joint, seed, elsewhere=elsewhere, workers=workers, progress=progress
+    )
+    load_files([_kept(_simulated(name), name, e) for name, e in emulations.items()])
+    return emulations
 
 
 def prepare_field(

@@ -11,12 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
+from calib.data.quantities import output_of
 from calib.errors import CalibError
 from calib.inference.constants import NEGLIGIBLE
 from calib.inference.design import across_zero
+from calib.inference.joint import JointProblem, calibrate_joint
 from calib.inference.mode import prior_widths
+from calib.inference.priors import Prior
 from calib.inference.problem import Problem
-from calib.inference.random import stream
+from calib.inference.random import generator, stream
 from calib.inference.sampler import SamplerSettings, sample_posterior
 from calib.models.base import Array
 from calib.models.simulators.emulator import (
@@ -138,49 +141,32 @@ class Emulation:
 _ROUGH = SamplerSettings(ensembles=2, walkers=64, steps=60, max_steps=60, keep=1024)
 
 
-class State:
-    """What is known so far for a problem's posterior; `nodes` (m,) are conditions of each run.
+class Known:
+    """What is known of one output: values of the runs on the scale of its response, an emulator.
 
-    `most` runs are made at the most, those that were `tried` before among them. Nodes `across` zero
-    (m,) serve a diagnosis only, which asks what another rolling radius does to small slips: they
-    are given up where runs near the posterior are wild there, or have a value but for them.
+    Parameters
+    ----------
+    problem : Problem
+    axes : Axes
+        Of the simulator's parameters, in which posteriors lie in `regions`.
+    nodes : mapping of str to ndarray, shape (m,)
+        Conditions of each run.
+    across : ndarray of bool, shape (m,)
+        See `State`.
     """
 
     def __init__(
-        self, problem: Problem, keeper: RunKeeper, nodes: Mapping[str, Array], seed: int,
-        most: int = 0, label: str = "emulate", across: NDArray[np.bool_] | None = None,
-        tried: Sequence[Run] = (), progress: Progress | None = None,
-    ) -> None:  # fmt: skip
-        self.problem, self.keeper, self.nodes = problem, keeper, nodes
-        self.seed, self.most, self.label, self.progress = seed, most, label, progress
-        entries = problem.priors.entries[:-1]
-        self.axes = _axes(problem)
-        self.free = np.array([not p.fixed for p in entries])
-        n = next(iter(nodes.values())).size
-        self.across = np.zeros(n, dtype=bool) if across is None else across
-        self.training = Training(np.zeros((0, len(entries))), np.zeros((0, n)), nodes)
-        self.runs: list[Run] = list(tried)
+        self, problem: Problem, axes: Axes, nodes: Mapping[str, Array], across: NDArray[np.bool_]
+    ) -> None:
+        self.problem = self.emulated = problem
+        self.axes, self.across = axes, across
+        self.training = Training(
+            np.zeros((0, axes.loc.size)), np.zeros((0, across.size)), nodes
+        )  # fmt: skip
         self.sigma = 0.1 * float(problem.response.std())
         self.own_noise = 0.0
+        self.regions: tuple[Region, ...] = ()
         self._emulator: Emulator | None = None
-        self.emulated = problem
-        self.mode: Array | None = None
-        self.region: Region | None = None
-        self.earlier: tuple[Region, ...] = ()
-
-    @classmethod
-    def beyond(
-        cls, emulator: Emulator, problem: Problem, keeper: RunKeeper, seed: int, most: int,
-        progress: Progress | None = None,
-    ) -> State:  # fmt: skip
-        """Return the state in which an emulator begins to serve another problem as well."""
-        nodes = emulator.training.nodes
-        across = across_zero(nodes)
-        state = cls(problem, keeper, nodes, seed, most, "extend", across, progress=progress)
-        state.training, state._emulator = emulator.training, emulator
-        state.earlier = emulator.regions
-        state._emulate(emulator)
-        return state
 
     @property
     def emulator(self) -> Emulator:
@@ -190,112 +176,56 @@ class State:
         return self._emulator
 
     @property
-    def left(self) -> int:
-        """How many runs may still be made."""
-        return max(self.most - len(self.runs), 0)
+    def built(self) -> int:
+        """On how many runs the emulator stands."""
+        return 0 if self._emulator is None else len(self._emulator.training.theta)
 
-    def _emulate(self, emulator: Emulator) -> None:
-        model = emulated_model(self.problem.bound.model, emulator)
-        self.emulated = replace(self.problem, bound=replace(self.problem.bound, model=model))
+    def use(self, emulator: Emulator) -> None:
+        """Put an emulator in the place of the model."""
+        self._emulator, bound = emulator, self.problem.bound
+        model = emulated_model(bound.model, emulator)
+        self.emulated = replace(self.problem, bound=replace(bound, model=model))
 
-    def carry_out(self, theta: Array) -> Array:
-        """Make runs; return their values on the scale of the response, shape (k, m)."""
-        values = self._made(theta, self.nodes)
-        lost = np.flatnonzero(~np.isfinite(values).all(axis=1))
-        before = len(self.runs)
-        plain = self._without_across(theta[lost[0]]) if lost.size else None
-        if plain is not None:
-            self.runs = [*map(across_too, self.runs[:before]), *self.runs[before:]]
-            values = values[:, ~self.across]
-            self._give_up_across()
-            if self._emulator is not None:
-                self.rebuild()
-            values[lost[0]] = plain
-            lost = lost[1 : 1 + self.left]
-            values[lost] = self._made(theta[lost], self.nodes)
-        return values
-
-    def repeat(self, theta: Array, replicate: int) -> Array:
-        """Make runs that had a value again; return values as `carry_out` does."""
-        return self._made(theta, self.nodes, replicate)
-
-    def _without_across(self, theta: Array) -> Array | None:
-        """Return the values (d,) of a failed run, repeated without the nodes across zero.
-
-        None if it fails there too, or failed by chance.
-        """
-        if self.earlier or not self.across.any() or self.left < 2:
-            return None
-        plain = {name: v[~self.across] for name, v in self.nodes.items()}
-        (found,) = self._made(theta[None], plain)
-        if not np.isfinite(found).all():
-            return None
-        again = self._made(theta[None], self.nodes, 99)
-        return None if np.isfinite(again).all() else np.asarray(found)
-
-    def _give_up_across(self) -> None:
-        """Go on without the nodes across zero; of the runs so far the other values are kept."""
-        kept = ~self.across
-        self.nodes = {name: v[kept] for name, v in self.nodes.items()}
-        self.across = self.across[kept]
-        self.training = replace(
-            self.training, values=self.training.values[:, kept], nodes=self.nodes
-        )
-
-    def _made(self, theta: Array, nodes: Mapping[str, Array], replicate: int = 0) -> Array:
-        found = self.keeper.runs(theta, nodes, replicate)
-        self.runs += found
-        n = next(iter(nodes.values())).size
-        return np.array([self._response(run, n) for run in found]).reshape(-1, n)
-
-    def _response(self, run: Run, n: int) -> Array:
-        """Return a run's values on the scale of the response, NaN if it has none, shape (n,)."""
-        if not run.ok:
-            return np.full(n, np.nan)
+    def values(self, runs: Sequence[Run], n: int) -> Array:
+        """Return runs on the scale of the response, NaN of those without a value, shape (k, n)."""
+        column, empty = self.problem.bound.model.output, np.full(n, np.nan)
         with np.errstate(all="ignore"):
-            return self.problem.bound.to_response(run.outputs[self.problem.bound.model.output])
+            found = [self.problem.bound.to_response(r.outputs.get(column, empty)) for r in runs]
+        return np.array(found).reshape(-1, n)
 
     def outputs(self, values: Array) -> Array:
         """Return values (k, m) as outputs, without those across zero."""
         return self.problem.bound.from_response(values[:, ~self.across])
 
-    def learn(self, theta: Array, values: Array) -> None:
-        """Take runs into the training."""
-        self.training = self.training.plus(theta, values)
+    def without_across(self, nodes: Mapping[str, Array]) -> None:
+        """Go on with other nodes, those not across zero; the other values are kept."""
+        values = self.training.values[:, ~self.across]
+        self.training = replace(self.training, values=values, nodes=nodes)
+        self.across = self.across[~self.across]
 
-    def rebuild(self) -> None:
-        """Fit the emulator again to all runs."""
-        if self._wild_near():
-            self._give_up_across()
-        known, runs = self._emulator, len(self.training.theta)
-        self._tell("runs in the emulator", 0 if known is None else len(known.training.theta), runs)
-        again = self.region is None or known is None or known.mean.size != self.across.size
-        self._emulator = build_emulator(
-            replace(self.training, values=self.tamed(self.training.values)), self.axes,
-            NEGLIGIBLE * self.sigma, self._regions,
-            scales=None if known is None else known.functions.scales,
-            over=None if again or known is None else known.over,
+    def rebuild(self, *, again: bool) -> None:
+        """Fit the emulator again to all runs, `again` over the conditions as well."""
+        known = self._emulator
+        again |= known is None or known.mean.size != self.across.size
+        self.use(
+            build_emulator(
+                replace(self.training, values=self.tamed(self.training.values)), self.axes,
+                NEGLIGIBLE * self.sigma, self.regions,
+                scales=None if known is None else known.functions.scales,
+                over=None if again or known is None else known.over,
+            )
         )  # fmt: skip
-        self._emulate(self._emulator)
-        self._tell("runs in the emulator", runs, runs)
-
-    def _tell(self, what: str, done: int, planned: int) -> None:
-        if self.progress is not None:
-            self.progress(what, done, planned)
-
-    @property
-    def _regions(self) -> tuple[Region, ...]:
-        return self.earlier if self.region is None else (*self.earlier, self.region)
 
     def tamed(self, values: Array) -> Array:
         """Return values (..., m), those across zero no wilder than a process can bear."""
         low, high = self._bounds()
         return np.where(self.across, np.clip(values, low, high), values)
 
-    def _wild_near(self) -> bool:
+    @property
+    def wild_near(self) -> bool:
         """Whether there are wild values near the posterior, as far as that is known."""
         values, known = self._near()
-        return known and not self.earlier and bool((self.tamed(values) != values).any())
+        return known and bool((self.tamed(values) != values).any())
 
     def _bounds(self) -> tuple[float, float]:
         """Beyond which values across zero are wild: by what the others are near the posterior."""
@@ -310,38 +240,221 @@ class State:
         ok = self.training.ok
         z, values = self.axes.of(self.training.theta[ok]), self.training.values[ok]
         inside = np.zeros(len(z), dtype=bool)
-        for region in self._regions:
+        for region in self.regions:
             inside |= region.inside(z)
         known = bool(inside.sum() >= 8)
         return (values[inside] if known else values), known
 
+    def error(self, z: Array) -> float:
+        """The emulator's expected error at draws, rms over the rows, in sds of the noise."""
+        return float(np.sqrt(self.row_variance(z).mean()))
+
+    def row_variance(self, z: Array) -> Array:
+        """Mean over the data's rows of the emulator's variance, in that of the noise, (k,)."""
+        _, unknown = self.emulator.with_unknown(self.axes.natural(z))
+        curves = self.emulator.curves_at(self.problem.conditions)[:, 1:]
+        total = unknown * float((curves**2 @ self.emulator.variances).sum())
+        return np.asarray(total / (len(curves) * self.sigma**2))
+
+
+class State:
+    """What is known so far of outputs that have a posterior; `nodes` (m,) are those of each run.
+
+    The posterior is that of the one output's problem, or of a `joint` problem, in which others may
+    have a part. `most` runs are made at the most, those that were `tried` before among them. Nodes
+    `across` zero (m,) serve a diagnosis only, which asks what another rolling radius does to small
+    slips: they are given up where runs near the posterior are wild there, or have a value but for
+    them.
+    """
+
+    def __init__(
+        self, problems: Sequence[Problem], keeper: RunKeeper, nodes: Mapping[str, Array],
+        seed: int, most: int = 0, label: str = "emulate", across: NDArray[np.bool_] | None = None,
+        tried: Sequence[Run] = (), progress: Progress | None = None,
+        joint: JointProblem | None = None,
+    ) -> None:  # fmt: skip
+        self.keeper, self.nodes, self.joint = keeper, nodes, joint
+        self.seed, self.most, self.label, self.progress = seed, most, label, progress
+        self.axes = _axes(problems[0])
+        self.free = np.array([not p.fixed for p in _entries(problems[0])])
+        n = next(iter(nodes.values())).size
+        self.across = np.zeros(n, dtype=bool) if across is None else across
+        self.outputs = tuple(Known(p, self.axes, nodes, self.across) for p in problems)
+        self.runs: list[Run] = list(tried)
+        self.mode: Array | None = None
+        self.region: Region | None = None
+        self.earlier: tuple[Region, ...] = ()
+
+    @classmethod
+    def beyond(
+        cls, emulator: Emulator, problem: Problem, keeper: RunKeeper, seed: int, most: int,
+        progress: Progress | None = None,
+    ) -> State:  # fmt: skip
+        """Return the state in which an emulator begins to serve another problem as well."""
+        nodes = emulator.training.nodes
+        across = across_zero(nodes)
+        state = cls([problem], keeper, nodes, seed, most, "extend", across, progress=progress)
+        state.outputs[0].training, state.earlier = emulator.training, emulator.regions
+        state.outputs[0].use(emulator)
+        return state
+
+    @property
+    def name(self) -> str:
+        """What is emulated, for messages."""
+        return ", ".join(known.problem.bound.model.name for known in self.outputs)
+
+    @property
+    def emulator(self) -> Emulator:
+        """That of the first output: all know alike where there are values."""
+        return self.outputs[0].emulator
+
+    @property
+    def training(self) -> Training:
+        """That of the first output: all learn from the same runs."""
+        return self.outputs[0].training
+
+    @property
+    def scatters(self) -> bool:
+        """Whether a simulator that is declared deterministic gives other values each time."""
+        own = any(known.own_noise for known in self.outputs)
+        return own and self.keeper.simulator.deterministic
+
+    @property
+    def left(self) -> int:
+        """How many runs may still be made."""
+        return max(self.most - len(self.runs), 0)
+
+    def carry_out(self, theta: Array) -> Array:
+        """Make runs; return values of outputs (o) on the scales of the responses, (k, o, m)."""
+        values = self._made(theta, self.nodes)
+        lost = np.flatnonzero(~has_value(values))
+        before = len(self.runs)
+        plain = self._without_across(theta[lost[0]]) if lost.size else None
+        if plain is not None:
+            self.runs = [*map(across_too, self.runs[:before]), *self.runs[before:]]
+            values = values[..., ~self.across]
+            self._give_up_across()
+            if self.outputs[0].built:
+                self.rebuild()
+            values[lost[0]] = plain
+            lost = lost[1 : 1 + self.left]
+            values[lost] = self._made(theta[lost], self.nodes)
+        return values
+
+    def repeat(self, theta: Array, replicate: int) -> Array:
+        """Make runs that had a value again; return values as `carry_out` does."""
+        return self._made(theta, self.nodes, replicate)
+
+    def _without_across(self, theta: Array) -> Array | None:
+        """Return the values (o, d) of a failed run, repeated without the nodes across zero.
+
+        None if it fails there too, or failed by chance.
+        """
+        if self.earlier or not self.across.any() or self.left < 2:
+            return None
+        plain = {name: v[~self.across] for name, v in self.nodes.items()}
+        found = self._made(theta[None], plain)
+        if not has_value(found)[0]:
+            return None
+        again = self._made(theta[None], self.nodes, 99)
+        return None if has_value(again)[0] else found[0]
+
+    def _give_up_across(self) -> None:
+        """Go on without the nodes across zero."""
+        self.nodes = {name: v[~self.across] for name, v in self.nodes.items()}
+        self.across = self.across[~self.across]
+        for known in self.outputs:
+            known.without_across(self.nodes)
+
+    def _made(self, theta: Array, nodes: Mapping[str, Array], replicate: int = 0) -> Array:
+        found = self.keeper.runs(theta, nodes, replicate)
+        self.runs += found
+        n = next(iter(nodes.values())).size
+        values = np.stack([known.values(found, n) for known in self.outputs], axis=1)
+        values[~has_value(values)] = np.nan
+        return values
+
+    def learn(self, theta: Array, values: Array) -> None:
+        """Take runs into the training, values (k, o, m)."""
+        for i, known in enumerate(self.outputs):
+            known.training = known.training.plus(theta, values[:, i])
+
+    def tamed(self, values: Array) -> Array:
+        """Return values (..., o, m) as `Known.tamed` does each."""
+        return np.stack([k.tamed(values[..., i, :]) for i, k in enumerate(self.outputs)], axis=-2)
+
+    def rebuild(self) -> None:
+        """Fit the emulators again to all runs."""
+        for known in self.outputs:
+            known.regions = (*self.earlier, *([] if self.region is None else [self.region]))
+        if not self.earlier and any(known.wild_near for known in self.outputs):
+            self._give_up_across()
+        runs = len(self.training.theta)
+        self._tell("runs in the emulator", self.outputs[0].built, runs)
+        for known in self.outputs:
+            known.rebuild(again=self.region is None)
+        self._tell("runs in the emulator", runs, runs)
+
+    def _tell(self, what: str, done: int, planned: int) -> None:
+        if self.progress is not None:
+            self.progress(what, done, planned)
+
     def sample(self, step: int) -> Array:
-        """Draw from the posterior under the emulator; return z of the draws, shape (k, d)."""
+        """Draw from the posterior under the emulators; return z of the draws, shape (k, d)."""
         self._tell("sampling for the next runs", 0, 1)
-        starts = None if self.mode is None else self.mode[None]
+        tell = partial(self._tell, "sampling for the next runs")
         try:
-            draws = sample_posterior(
-                self.emulated, stream(self.seed, self.label, step), starts=starts, settings=_ROUGH,
-                progress=partial(self._tell, "sampling for the next runs"),
-            )  # fmt: skip
+            z = self._drawn(step, tell) if self.joint is None else self._drawn_jointly(step, tell)
         except CalibError as error:
             raise self.without_value("no parameters are left for the data") from error
-        self.mode = draws.mode
-        picked = np.linspace(0, len(draws.flat) - 1, 512).round().astype(int)
-        natural = self.emulated.theta(draws.flat[picked])
-        self.sigma = float(np.median(natural[:, -1]))
-        z = self.axes.of(natural[:, :-1])
         self.region = _region(z, self.free)
         return z
+
+    def _drawn(self, step: int, tell: Callable[[int, int], None]) -> Array:
+        (known,) = self.outputs
+        draws = sample_posterior(
+            known.emulated, stream(self.seed, self.label, step), settings=_ROUGH, progress=tell,
+            starts=None if self.mode is None else self.mode[None],
+        )  # fmt: skip
+        self.mode = draws.mode
+        natural = known.emulated.theta(_some(draws.flat))
+        known.sigma = float(np.median(natural[:, -1]))
+        return self.axes.of(known.problem.of_model(natural))
+
+    def _drawn_jointly(self, step: int, tell: Callable[[int, int], None]) -> Array:
+        """Draw from the joint posterior: parameters of all groups, where there are groups."""
+        if self.joint is None:
+            raise RuntimeError("there is no joint posterior")
+        joint = self.joint.with_models([known.emulated.bound.model for known in self.outputs])
+        seed = int(generator(self.seed, self.label, step).integers(2**31))
+        found = calibrate_joint(joint, seed, settings=_ROUGH, progress=tell)
+        of_group: dict[str, Array] = {}
+        for known in self.outputs:
+            sigmas = []
+            output = output_of(known.problem.bound.model.output)
+            for group in [g for o, g in joint.parts if o == output]:
+                part = found.calibration(output, group or None)
+                natural = part.problem.theta(_some(part.draws.flat))
+                sigmas.append(float(np.median(natural[:, -1])))
+                of_group.setdefault(group, self.axes.of(known.problem.of_model(natural)))
+            known.sigma = min(sigmas)
+        return _some(np.concatenate([*of_group.values()]))
 
     def without_value(self, why: str) -> CalibError:
         """Return what to say where runs that failed are in the way."""
         return without_value(why, self.keeper.simulator, self.runs, self.keeper.folder)
 
     def error(self, z: Array) -> float:
-        """The emulator's expected error at draws, rms over the rows, in sds of the noise."""
-        rows = self.problem.response.size
-        return float(np.sqrt(self.row_variance(z).mean() / rows)) / self.sigma
+        """The largest error that an emulator expects at draws, see `Known.error`."""
+        return max(known.error(z) for known in self.outputs)
+
+    def serves(self, z: Array) -> bool:
+        """Whether nearly all draws lie where an emulator that is there was found good."""
+        inside = np.zeros(len(z), dtype=bool)
+        for region in self.earlier:
+            inside |= region.inside(z)
+        good = bool(self.earlier) and self.emulator.good and self.emulator.support is None
+        return good and bool(inside.mean() > 0.95)
 
     def lost(self, z: Array) -> bool:
         """Whether to most draws a run that failed is closer than any other: no value is known."""
@@ -351,11 +464,15 @@ class State:
         nearest = cdist(self.region.coordinates(z), runs).argmin(axis=1)
         return bool((~self.training.ok[nearest]).mean() > 0.5)
 
-    def row_variance(self, z: Array) -> Array:
-        """Sum over the data's rows of the emulator's variance, shape (k,)."""
-        _, unknown = self.emulator.with_unknown(self.axes.natural(z))
-        curves = self.emulator.curves_at(self.problem.conditions)[:, 1:]
-        return unknown * float((curves**2 @ self.emulator.variances).sum())
+
+def has_value(values: Array) -> NDArray[np.bool_]:
+    """Whether runs have all their values (k, o, m), shape (k,)."""
+    return np.asarray(np.isfinite(values).all(axis=(1, 2)))
+
+
+def _some(draws: Array) -> Array:
+    """Return 512 of draws (k, d), evenly picked."""
+    return np.asarray(draws[np.linspace(0, len(draws) - 1, 512).round().astype(int)])
 
 
 def across_too(run: Run) -> Run:
@@ -366,8 +483,13 @@ def across_too(run: Run) -> Run:
     return replace(run, failure=replace(run.failure, reason=reason))
 
 
+def _entries(problem: Problem) -> tuple[Prior, ...]:
+    """Priors of the simulator's parameters."""
+    return problem.priors.entries[: len(problem.bound.model.parameters)]
+
+
 def _axes(problem: Problem) -> Axes:
-    entries = problem.priors.entries[:-1]
+    entries = _entries(problem)
     free = np.array([not p.fixed for p in entries])
     width = np.ones(len(entries))
     width[free] = prior_widths(problem.priors)[: int(free.sum())]

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FunctionType
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -25,6 +25,8 @@ from calib.models.base import (
     Array,
     Conditions,
     Model,
+    Parameters,
+    References,
     check_model,
     check_names,
     check_word,
@@ -227,14 +229,25 @@ class Direct:
             )
         runner = self.simulator.runner
         if isinstance(runner, CallableRunner) and runner.batched:
-            asked = self.simulator.asked(conditions)
             try:
-                return self.simulator.converted(runner.call(theta.copy(), asked), self.output)
+                return self._at_all(runner, theta, self.simulator.asked(conditions))
             except CalibError as error:
                 raise error.within(self.simulator.place()) from None
         empty = np.full(next(iter(conditions.values())).shape[-1], np.nan)
         runs = [self._run(t, conditions) for t in theta]
         return np.stack([run.outputs.get(self.output, empty) for run in runs])
+
+    def _at_all(self, runner: CallableRunner, theta: Array, asked: Conditions) -> Array:
+        """Return the output of a function that takes all parameters at once, by its series."""
+        simulator, found = self.simulator, []
+        whole, places = simulator.whole(theta), simulator.series(asked)
+        for rows in places:
+            part = {name: v[rows] for name, v in asked.items()}
+            outputs = simulator.resampled(runner.call(whole.copy(), part), part)
+            found.append(simulator.converted(outputs, self.output))
+        if not simulator.along:
+            return found[0]
+        return np.concatenate(found, axis=-1)[..., np.argsort(np.concatenate(places))]
 
     @property
     def _at_once(self) -> bool:
@@ -249,6 +262,17 @@ class Direct:
         return run
 
 
+@dataclass(frozen=True)
+class Published:
+    """Reports parameters that follow from others beside these."""
+
+    simulator: Simulator
+
+    def __call__(self, references: References, /, **parameters: Any) -> Parameters:
+        """Return all by name."""
+        return self.simulator.with_derived(parameters)
+
+
 def models_of(simulator: Simulator) -> tuple[Model, ...]:
     """Return a model for each output of a simulator."""
     return tuple(_model(simulator, output) for output in simulator.outputs)
@@ -257,6 +281,11 @@ def models_of(simulator: Simulator) -> tuple[Model, ...]:
 def _model(simulator: Simulator, output: Output) -> Model:
     column = simulator.canonical(output.header)
     quantity = QUANTITIES[column]
+    response: Literal["identity", "log"] = "log" if quantity.log_scale else "identity"
+    if output.response:
+        response = "log" if output.response == "log" else "identity"
+    priors = tomllib.loads(simulator.priors)["parameters"]
+    units = {name: str(priors[name].get("unit", "1")) for name in simulator.parameters}
     alone = len(simulator.outputs) == 1
     name = simulator.name if alone else f"{simulator.name}_{quantity.stem}"
     return Model(
@@ -266,7 +295,9 @@ def _model(simulator: Simulator, output: Output) -> Model:
         conditions=simulator.takes,
         parameters=simulator.parameters,
         predict=Direct(simulator, column),
-        response="log" if quantity.log_scale else "identity",
+        response=response,
+        reported=units | dict.fromkeys(simulator.derived, "") if simulator.derived else {},
+        to_reported=Published(simulator),
         source=simulator.source,
         parametrisation="The parameters of the simulator are sampled.",
         slow=simulator.emulate,
@@ -279,13 +310,15 @@ def from_callable(
     *,
     parameters: str,
     conditions: Mapping[str, str] | Sequence[str],
-    output: str | Mapping[str, str],
+    output: str | Mapping[str, str | Mapping[str, str]],
     name: str = "",
     batched: bool = True,
     emulate: bool = False,
     folder: Path | None = None,
     deterministic: bool = True,
     limit: float | None = None,
+    derived: Mapping[str, str] | None = None,
+    along: str = "",
     **budget: float,
 ) -> Simulated:
     """Make a simulator of a Python function; `calib.register` makes its models known.
@@ -302,8 +335,10 @@ def from_callable(
     conditions : mapping of str to str, or sequence of str
         The function's own name of each condition to a column name with the unit that it takes;
         the column names alone where both are the same.
-    output : str or mapping of str to str
-        A column name with the unit of what it returns; of several, by the function's own names.
+    output : str, or mapping of str to str or mapping
+        A column name with the unit of what it returns; of several, by the function's own names. Of
+        ``{"column": NAME, "response": "identity"}`` the noise is additive, and values may be
+        negative; ``"log"`` has it relative. The quantity says it by default.
     name : str, optional
         That of the function by default.
     batched : bool
@@ -317,6 +352,13 @@ def from_callable(
         Seconds that a run may take if it is emulated. It is then made in a process of its own,
         which is ended with what it has started when they have passed; without a limit, in this
         process, for as long as it takes.
+    derived : mapping of str to str, optional
+        Formulas of parameters that follow from others, ``{"b_rear": "b_front / 2"}``: it gets them
+        behind these.
+    along : str, optional
+        Its own name of a condition, such as time. It is then called for each setting of the other
+        conditions, rows in this order, and gives a series. One that returns this condition too is
+        interpolated between its own values.
     **budget
         ``runs``, ``first``, ``checks``, ``tolerance``, ``nodes``: see `EmulationSettings`.
 
@@ -347,10 +389,12 @@ def from_callable(
     >>> simulator.models
     ('my_wheel',)
     """
-    named = {output: output} if isinstance(output, str) else dict(output)
+    named: dict[str, str | Mapping[str, str]] = (
+        {output: output} if isinstance(output, str) else dict(output)
+    )
     taken = dict(conditions) if isinstance(conditions, Mapping) else {c: c for c in conditions}
     try:
-        tables = tomllib.loads(parameters).get("parameters", {})
+        given = tomllib.loads(parameters)
     except tomllib.TOMLDecodeError as error:
         raise CalibError(
             f"the priors are not valid TOML: {error}", where=f"simulator {name}", hint=TOML_HINT
@@ -358,13 +402,16 @@ def from_callable(
     return declare(
         name or getattr(f, "__name__", "simulator"),
         CallableRunner(f, tuple(named), batched, limit),
-        tables,
+        given.get("parameters", {}),
         taken,
         named,
         folder=folder,
         emulate=emulate,
         deterministic=deterministic,
         budget=budget,
+        likelihood=given.get("likelihood"),
+        derived=dict(derived or {}),
+        along=along,
         **({} if limit is None else {"limit": limit}),
     )
 
@@ -374,16 +421,17 @@ def declare(
     runner: Runner,
     priors: Mapping[str, Any],
     conditions: Mapping[str, str],
-    outputs: Mapping[str, str],
+    outputs: Mapping[str, str | Mapping[str, str]],
     *,
     folder: Path | None = None,
     budget: Mapping[str, float] | None = None,
+    likelihood: Mapping[str, Any] | None = None,
     **details: Any,
 ) -> Simulated:
     """Put a simulator together from its parts, `details` being other fields of `Simulator`.
 
-    Priors are the tables ``parameters.NAME``, those of the noise among them; conditions and outputs
-    map the simulator's own names to headers.
+    Priors are the tables ``parameters.NAME``, those of the noise among them, and the `likelihood`
+    that of a prior file; conditions and outputs map the simulator's own names to headers.
     """
     where = f"simulator {name}"
     emulation = _emulation(runner, budget or {}, where)
@@ -405,21 +453,41 @@ def declare(
             expected=f"[parameters.{missing[0]}] with dist, unit, reason and source",
             hint="add it: how far may readings lie from a perfect simulator's?",
         )
+    noise = _table("likelihood", likelihood) if likelihood else ""
+    tables = {own: {"column": o} if isinstance(o, str) else o for own, o in outputs.items()}
     declared = [
-        Output(header, own, written("sigma", priors[sigmas[own]]))
-        for own, header in outputs.items()
+        Output(
+            o["column"], own, written("sigma", priors[sigmas[own]]) + noise, o.get("response", "")
+        )
+        for own, o in tables.items()
     ]
     parameters = tuple(p for p in priors if p not in sigmas.values())
     text = "\n".join(written(p, priors[p]) for p in parameters)
     simulator = Simulator(name, runner, parameters, text, conditions, tuple(declared), **details)
-    _check_own_names(simulator, outputs)
+    _check_own_names(simulator, {o.column: o.header for o in declared})
+    _check_derived(simulator)
+    if simulator.along and simulator.along not in conditions:
+        raise CalibError(
+            f"{simulator.along!r} is no condition", where=f"{where}, along",
+            expected=", ".join(conditions), hint="name the condition that its series are along",
+        )  # fmt: skip
     return Simulated(simulator, folder, emulation)
+
+
+def _check_derived(simulator: Simulator) -> None:
+    """Check that formulas can be worked out."""
+    found = simulator.with_derived(dict.fromkeys(simulator.parameters, 1.0))
+    for name in simulator.derived:
+        check_word(name, "parameter", f"simulator {simulator.name}")
+        if np.ndim(found[name]):
+            raise CalibError(f"{name} is no number", where=f"simulator {simulator.name}")
 
 
 def _check_own_names(simulator: Simulator, outputs: Mapping[str, str]) -> None:
     """Check that each name, and then each column, is that of one thing."""
     where = f"simulator {simulator.name}"
     parameters = [(p, f"the parameter {p}", f"parameters.{p}") for p in simulator.parameters]
+    parameters += [(p, f"the parameter {p}", f"derived.{p}") for p in simulator.derived]
     names, columns = list(parameters), list(parameters)
     for key, table in (("conditions", simulator.conditions), ("outputs", outputs)):
         names += [(own, f"the {key[:-1]} {own}", f"{key}.{own}") for own in table]
@@ -468,9 +536,13 @@ def _emulation(runner: Runner, given: Mapping[str, float], where: str) -> Emulat
 
 def written(name: str, table: Mapping[str, Any]) -> str:
     """Write a table ``[parameters.NAME]``."""
-    lines = [f"{key} = {_toml(value)}" for key, value in table.items()]
     key = name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _toml(name)  # else in quotes
-    return "\n".join([f"[parameters.{key}]", *lines]) + "\n"
+    return _table(f"parameters.{key}", table)
+
+
+def _table(heading: str, table: Mapping[str, Any]) -> str:
+    lines = [f"{key} = {_toml(value)}" for key, value in table.items()]
+    return "\n".join([f"[{heading}]", *lines]) + "\n"
 
 
 def _toml(value: Any) -> str:

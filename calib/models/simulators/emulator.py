@@ -143,7 +143,7 @@ class Emulator:
     `negligible` is an error of the output that does not matter, `mean` (m,) and `curves` (j, m) the
     orthonormal basis, `functions` the coefficients as functions of the parameters in units of the
     prior's sds. `support` says where there is a value at all, `near` the same more finely in
-    regions in which some runs failed.
+    regions in which some runs failed; `good` whether it was found good enough in all regions.
     """
 
     training: Training
@@ -156,6 +156,7 @@ class Emulator:
     regions: tuple[Region, ...]
     support: Support | None
     near: tuple[tuple[Region, Support], ...] = ()
+    good: bool = False
 
     @cached_property
     def _weights(self) -> Array:
@@ -341,6 +342,7 @@ def save_emulator(emulator: Emulator, model: str, path: Path) -> None:
     meta = {
         "model": model, "nodes": list(t.nodes), "noisy": t.noisy,
         "negligible": emulator.negligible, "reach": [r.reach for r in emulator.regions],
+        "good": emulator.good,
     }  # fmt: skip
     arrays: dict[str, Any] = {
         "meta": np.array(json.dumps(meta)), "theta": t.theta, "values": t.values,
@@ -382,12 +384,13 @@ def _built(meta: dict[str, Any], arrays: dict[str, Any]) -> Emulator:
     # Files of earlier versions have scales for each curve, which are estimated again.
     kept = Scales(arrays["lengths"], float(arrays["nugget"])) if "nugget" in arrays else None
     values = arrays["values"]
-    return build_emulator(
+    found = build_emulator(
         Training(arrays["theta"], values, nodes, bool(meta["noisy"])),
         Axes(arrays["log"], arrays["loc"], arrays["width"]), meta["negligible"], regions,
         scales=kept, known=kept is not None,
         over=over_conditions(nodes, values[:1], arrays["over"]),
     )  # fmt: skip
+    return replace(found, good=bool(meta.get("good", False)))
 
 
 def use_emulator(path: Path) -> None:

@@ -35,6 +35,14 @@ def _without_null(text: str) -> str:
 _Text = Annotated[str, AfterValidator(_without_null)]
 
 
+class OutputTable(BaseModel):
+    """What a simulator file may say of an output beside its column."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    column: str
+    response: Literal["", "identity", "log"] = ""
+
+
 class SimulatorFile(BaseModel):
     """What a simulator file may say; exactly one of run, python, url and table."""
 
@@ -59,7 +67,10 @@ class SimulatorFile(BaseModel):
     cache: _Text = ""
     files: tuple[_Text, ...] = ()
     conditions: dict[str, str] = Field(min_length=1)
-    outputs: dict[str, str] = Field(min_length=1)
+    outputs: dict[str, str | OutputTable] = Field(min_length=1)
+    derived: dict[str, str] = {}
+    along: str = ""
+    likelihood: dict[str, Any] = {}
     patterns: dict[str, str] = {}
     ranges: dict[str, tuple[float, float]] = {}
     emulator: EmulationSettings = EmulationSettings()
@@ -124,15 +135,16 @@ def _declared(path: Path) -> Simulated:
         hashlib.sha256(_content(path.parent / name, "files", f"file {name!r}")).hexdigest()
         for name in file.files
     )
-    told = ("title", "source", "limit", "retries", "deterministic", "emulate")
+    told = ("title", "source", "limit", "retries", "deterministic", "emulate", "derived", "along")
     return declare(
         file.name,
         _runner(file, path.parent),
         file.parameters,
         file.conditions,
-        file.outputs,
+        {own: o if isinstance(o, str) else o.model_dump() for own, o in file.outputs.items()},
         folder=path.parent / (file.cache or f"{path.stem}.runs"),
         budget=file.emulator.model_dump(exclude_unset=True),
+        likelihood=file.likelihood,
         ranges=_ranges(file),
         made_of=made_of,
         file=str(path),
@@ -187,6 +199,11 @@ def _ranges(file: SimulatorFile) -> dict[str, tuple[float, float]]:
 
 
 def _runner(file: SimulatorFile, folder: Path) -> Runner:
+    if file.along and (file.rows == "each" or file.table):
+        raise CalibError(
+            "series are neither of a table of runs nor called for row by row", where="along",
+            expected='rows = "all", and run, python or url', hint="leave along out",
+        )  # fmt: skip
     makers: dict[str, Callable[[SimulatorFile, Path], Runner]] = {
         "run": _command,
         "python": _callable,
@@ -246,7 +263,7 @@ def _template(file: SimulatorFile, folder: Path) -> str:
         raise _unreadable("template", error, "template") from None
     noise = {"sigma", *(f"sigma_{own}" for own in file.outputs)}
     names = tuple(p for p in file.parameters if p not in noise)
-    check_template(template, (*names, *file.conditions), f"template {file.template}")
+    check_template(template, (*names, *file.derived, *file.conditions), f"template {file.template}")
     return template
 
 

@@ -255,13 +255,24 @@ class Over:
                 return cho_factor(k + nugget * np.eye(len(k)), lower=True)[0], True
         return cho_factor(k + NUGGETS_OVER[-1] * np.eye(len(k)), lower=True)[0], True
 
-    def left_out(self, curves: Array) -> Array:
-        """Return the errors at each node were it not one, shape (j, m) to (j, m)."""
+    def left_out(self, curves: Array) -> tuple[Array, Array]:
+        """Return the errors of curves (j, m) at each node were it not one, (j, m).
+
+        And which part of the variance is not known there, (m,).
+        """
         if not self.columns or len(self.nodes) < 3:
-            return np.zeros_like(curves)
+            return np.zeros_like(curves), np.ones(len(self.nodes))
         inverse = cho_solve(self._factor(), np.eye(len(self.nodes)))
         centred = curves - curves.mean(axis=1, keepdims=True)
-        return np.asarray(centred @ inverse / np.diag(inverse))
+        return np.asarray(centred @ inverse / np.diag(inverse)), 1.0 / np.diag(inverse)
+
+    def unknown(self, conditions: Mapping[str, Array]) -> Array:
+        """Return which part of the variance is not known at conditions (n,), shape (n,)."""
+        raw = [conditions[name] for name in self.columns]
+        if not raw:
+            return np.zeros(next(iter(conditions.values())).size)
+        k = _matern((np.stack(raw, axis=1) - self.low) / self.width, self.nodes, self.lengths)
+        return np.maximum(1.0 - (k * cho_solve(self._factor(), k.T).T).sum(axis=1), 0.0)
 
 
 def _matern(a: Array, b: Array, lengths: Array) -> Array:

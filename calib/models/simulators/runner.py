@@ -182,7 +182,7 @@ class CallableRunner:
 
     def run(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Given:
         """Call it for one parameter vector."""
-        theta = np.array(list(parameters.values()))
+        theta = np.array([*parameters.values()], dtype=np.float64)
         arguments = (theta[None] if self.batched else theta, conditions)
         try:
             if self.limit is None:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.batch.folders import writing
 from calib.batch.tasks import read_seconds, run_tasks
@@ -26,6 +27,7 @@ from calib.data.table import Column, parse_header
 from calib.errors import CalibError
 from calib.models.base import Array
 from calib.models.constants import FIRST_RUNS, TAIL_CHARACTERS
+from calib.models.simulators.derived import evaluate
 
 _log = logging.getLogger(__name__)
 
@@ -88,12 +90,14 @@ class Output:
 
     `header` is a column name of `calib.data.quantities` in the simulator's own unit, such as
     ``drawbar_pull_n``, `column` the simulator's name for it, and `sigma` the prior of its noise as
-    the TOML text of a table.
+    the TOML text of a table. The noise is additive on the scale of the `response`, ``identity`` or
+    ``log``; by default on that of the quantity.
     """
 
     header: str
     column: str
     sigma: str
+    response: str = ""
 
 
 @dataclass(frozen=True)
@@ -120,6 +124,11 @@ class Simulator:
         SHA-256 of what else its results depend on: libraries, tables of soils.
     file : str
         The simulator file, if any.
+    derived : mapping of str to str
+        Formulas of parameters that follow from others, and are passed to it behind these.
+    along : str
+        Its own name of a condition, such as time: a run is then made of a call for each setting of
+        the other conditions, which gives a series along this one.
     """
 
     name: str
@@ -137,13 +146,15 @@ class Simulator:
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     made_of: tuple[str, ...] = ()
     file: str = ""
+    derived: Mapping[str, str] = field(default_factory=dict)
+    along: str = ""
 
     @property
     def digest(self) -> str:
         """SHA-256 of whatever else its results depend on."""
         what = [self.runner.identity, list(self.parameters), dict(self.conditions)]
         what += [[o.header, o.column] for o in self.outputs]
-        what += [list(self.made_of)] if self.made_of else []
+        what += [part for part in (list(self.made_of), dict(self.derived), self.along) if part]
         return hashlib.sha256(json.dumps(what).encode()).hexdigest()
 
     def canonical(self, header: str) -> str:
@@ -162,6 +173,37 @@ class Simulator:
         """Canonical columns of its conditions."""
         return tuple(dict.fromkeys(map(self.canonical, self.conditions.values())))
 
+    @property
+    def series_along(self) -> str:
+        """Canonical column of the condition that its series are along; empty without one."""
+        return self.canonical(self.conditions[self.along]) if self.along else ""
+
+    def with_derived(self, parameters: Mapping[str, Any]) -> dict[str, Any]:
+        """Return parameters by name, numbers or arrays, and those that follow from them."""
+        found = dict(parameters)
+        for name, formula in self.derived.items():
+            try:
+                found[name] = evaluate(formula, found)
+            except CalibError as error:
+                raise error.within(f"simulator {self.name}, derived.{name}") from None
+        return found
+
+    def whole(self, theta: Array) -> Array:
+        """Return parameters (k, d) and those that follow from them, (k, d + e)."""
+        found = self.with_derived(dict(zip(self.parameters, theta.T, strict=True)))
+        return np.stack(np.broadcast_arrays(*found.values()), axis=1)
+
+    def series(self, conditions: Mapping[str, Array]) -> list[NDArray[np.intp]]:
+        """Return the places of the rows of each call, by conditions (n,) of its own names."""
+        n = next(iter(conditions.values())).size
+        if not self.along:
+            return [np.arange(n)]
+        others = [v for name, v in conditions.items() if name != self.along]
+        rows = np.stack([np.zeros(n), *others], axis=1)
+        of = np.unique(rows, axis=0, return_inverse=True)[1].ravel()
+        order = np.lexsort((conditions[self.along], of))
+        return np.split(order, np.flatnonzero(np.diff(of[order])) + 1)
+
     def run(self, theta: Array, conditions: Mapping[str, Array]) -> Result:
         """Make one run, and try again if it fails.
 
@@ -174,7 +216,7 @@ class Simulator:
         try:
             for _ in range(1 + self.retries):
                 # Each try gets copies.
-                found = self._once(dict(parameters), self.asked(conditions), n)
+                found = self._once(self.with_derived(parameters), self.asked(conditions), n)
                 if not isinstance(found, Failure):
                     return found
         except CalibError as error:
@@ -199,19 +241,49 @@ class Simulator:
             raise error.within(own.column) from None
         return column.to_canonical(values)
 
+    def resampled(self, found: RawOutputs, conditions: Mapping[str, Array]) -> RawOutputs:
+        """Return outputs at the rows of a series that says where its own values are.
+
+        Between these it is taken to be straight; a CalibError if it does not reach all rows.
+        """
+        if not self.along or self.along not in found:
+            return found
+        own, at = real_array(found[self.along]).ravel(), conditions[self.along]
+        slack = 1e-9 * np.ptp(own) if own.size > 1 and (np.diff(own) > 0.0).all() else np.nan
+        if not (at.min() >= own[0] - slack and at.max() <= own[-1] + slack):
+            raise CalibError(
+                f"{self.along} does not grow from {at.min():g} or less to {at.max():g} or more in "
+                f"{own.size} steps"
+            )
+        i = np.clip(np.searchsorted(own, at, "right") - 1, 0, own.size - 2)
+        ahead = (at - own[i]) / (own[i + 1] - own[i])
+        taken = {}
+        for output in (o for o in self.outputs if o.column in found):
+            values = real_array(found[output.column], _parsed(output.header, self.name).unit)
+            if values.shape[-1:] != own.shape:
+                raise CalibError(f"{output.column} and {self.along} differ in length")
+            taken[output.column] = (1.0 - ahead) * values[..., i] + ahead * values[..., i + 1]
+        return Printed(taken, getattr(found, "printed", ""))
+
     def _once(
         self, parameters: Mapping[str, float], conditions: Mapping[str, Array], n: int
     ) -> Result:
-        found = self.runner.run(parameters, conditions)
-        if isinstance(found, Failure):
-            return found
-        canonical: dict[str, Array] = {}
-        for output in self.outputs:
-            column = _parsed(output.header, self.name)
-            values = checked(found, output.column, n, column.unit)
-            if isinstance(values, Failure):
-                return values
-            canonical[column.quantity.canonical] = column.to_canonical(values)
+        canonical = {self.canonical(output.header): np.empty(n) for output in self.outputs}
+        for rows in self.series(conditions):
+            part = {name: v[rows] for name, v in conditions.items()}
+            found = self.runner.run(dict(parameters), dict(part))
+            if isinstance(found, Failure):
+                return found
+            try:
+                found = self.resampled(found, part)
+            except CalibError as error:
+                return Failure("short", error.message)
+            for output in self.outputs:
+                column = _parsed(output.header, self.name)
+                values = checked(found, output.column, rows.size, column.unit)
+                if isinstance(values, Failure):
+                    return values
+                canonical[column.quantity.canonical][rows] = column.to_canonical(values)
         return canonical
 
 

@@ -345,7 +345,8 @@ def test_a_parameter_that_changes_nothing_is_named(caplog: pytest.LogCaptureFixt
 @pytest.mark.parametrize(("made", "words"), [(150, "some 160 runs"), (181, "cannot be foreseen")])
 def test_no_fewer_runs_are_foreseen_than_were_made(made: int, words: str) -> None:
     problem = calib.build_problem(declared(pull, "slow", emulate=True).name, table())
-    state = State(problem, RunKeeper(SIMULATED["slow"].simulator), problem.conditions, 1, most=200)
+    keeper = RunKeeper(SIMULATED["slow"].simulator)
+    state = State([problem], keeper, problem.conditions, 1, most=200)
     state.runs = [Run(np.zeros(2), {})] * made
     said = foreseen(state, np.zeros((9, 2)), EmulationSettings(), [(75, 0.213), (150, 0.107)])
     assert words in said
