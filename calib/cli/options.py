@@ -323,11 +323,12 @@ def emulate_jointly(
 
     Emulations by model; `elsewhere` it is to predict too.
     """
-    from calib.inference.emulation.prepared import prepare_joint
+    from calib.inference.emulation.prepared import emulated_jointly, put_in_use
 
     others = [table for table in elsewhere if table is not None]
     with progress_bars() as tell:
-        found = prepare_joint(joint, seed, elsewhere=others, workers=workers, progress=tell)
+        found = emulated_jointly(joint, seed, elsewhere=others, workers=workers, progress=tell)[1]
+    put_in_use(found)
     return _said(found)
 
 

@@ -364,27 +364,13 @@ def prepare(
         build_problem(model, table, priors), seed, elsewhere=elsewhere, workers=workers,
         progress=progress,
     )  # fmt: skip
-    load_files([_kept(found, model, emulation)])
+    put_in_use({model: emulation})
     return emulation
 
 
-def prepare_joint(
-    joint: JointProblem,
-    seed: int,
-    *,
-    elsewhere: Sequence[Table] = (),
-    workers: int = 1,
-    progress: Progress | None = None,
-) -> dict[str, Emulation]:
-    """Emulate the slow simulators of a joint problem, for all that this process does from now on.
-
-    The same problem built again has the emulators. Nothing is returned of quick models.
-    """
-    _, emulations = emulated_jointly(
-        joint, seed, elsewhere=elsewhere, workers=workers, progress=progress
-    )
+def put_in_use(emulations: Mapping[str, Emulation]) -> None:
+    """Make models their emulators, for all that this process does from now on; keep these."""
     load_files([_kept(_simulated(name), name, e) for name, e in emulations.items()])
-    return emulations
 
 
 def prepare_field(
@@ -405,7 +391,7 @@ def prepare_field(
         return None
     problem = build_problem(model, field, priors)
     emulation = _extended(found, emulator, problem, seed, workers, progress)
-    load_files([_kept(found, model, emulation)])
+    put_in_use({model: emulation})
     return emulation
 
 

@@ -284,8 +284,8 @@ def _model(simulator: Simulator, output: Output) -> Model:
     response: Literal["identity", "log"] = "log" if quantity.log_scale else "identity"
     if output.response:
         response = "log" if output.response == "log" else "identity"
-    priors = tomllib.loads(simulator.priors)["parameters"]
-    units = {name: str(priors[name].get("unit", "1")) for name in simulator.parameters}
+    priors = tomllib.loads(simulator.priors)["parameters"] if simulator.derived else {}
+    units = {name: str(prior.get("unit", "1")) for name, prior in priors.items()}
     alone = len(simulator.outputs) == 1
     name = simulator.name if alone else f"{simulator.name}_{quantity.stem}"
     return Model(
@@ -296,7 +296,7 @@ def _model(simulator: Simulator, output: Output) -> Model:
         parameters=simulator.parameters,
         predict=Direct(simulator, column),
         response=response,
-        reported=units | dict.fromkeys(simulator.derived, "") if simulator.derived else {},
+        reported=units | dict.fromkeys(simulator.derived, ""),
         to_reported=Published(simulator),
         source=simulator.source,
         parametrisation="The parameters of the simulator are sampled.",

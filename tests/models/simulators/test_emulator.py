@@ -200,7 +200,7 @@ def test_curves_are_met_at_the_nodes_and_near_between() -> None:
     true = curves(*x.values())
     np.testing.assert_allclose(over.at(x, weights), true.T, atol=0.02 * 8.0)
     # What is left out tells how far off it is between nodes, to a factor.
-    assert 0.0 < np.abs(over.left_out(known)).max() < 1.0
+    assert 0.0 < np.abs(over.left_out(known)[0]).max() < 1.0
 
 
 def test_beyond_the_box_it_goes_on_straight_and_then_has_no_value() -> None:
