@@ -14,10 +14,11 @@ from calib.checking.folders import labels_in
 from calib.data.files import inside, plain_number, read_json
 from calib.errors import CalibError
 from calib.inference.io import RUN, load_calibration
+from calib.inference.joint_files import JOINT, load_joint
 from calib.report.comparison import FILE as COMPARISON
 from calib.report.labels import odds_text, percent, percent_range
 from calib.report.page.template import template
-from calib.report.verdict import kept_verdict
+from calib.report.verdict import joint_verdicts, kept_verdict
 
 FILE = "review.json"
 # Rows of a part of the page: it is one page, and `calib check --all` lists the rest.
@@ -105,6 +106,9 @@ def _open(folder: Path, outcome: Outcome) -> Rows:
         judged = kept_verdict(run) if (run / RUN).is_file() else None
         for remark in () if judged is None else judged.warnings:
             yield f"assumptions of {run.name}", remark
+    for place, one in joint_verdicts(folder).items() if (folder / JOINT).is_file() else ():
+        for remark in one.warnings:
+            yield f"assumptions of {place}", remark
     for name, found in inside(read_json(folder / SUMMARY), "models").items():
         for warning in inside(found).get("warnings", ()):
             yield f"assumptions of {name}", warning
@@ -131,6 +135,15 @@ def _of_run(folder: Path) -> Rows:
         calibration = load_calibration(folder)
         names = calibration.problem.names
         yield from _parameters({name: vars(calibration.summary[name]) for name in names})
+    except CalibError as error:
+        yield "posterior", error.message
+
+
+def _of_joint(folder: Path) -> Rows:
+    for place, judged in joint_verdicts(folder).items():
+        yield place, f"{judged.level.value}: {judged.headline}"
+    try:
+        yield from _parameters({n: vars(s) for n, s in load_joint(folder).summary.items()})
     except CalibError as error:
         yield "posterior", error.message
 
@@ -177,4 +190,5 @@ def _of_diagnosis(folder: Path) -> Rows:
 
 _CLAIMS: Mapping[str, Callable[[Path], Rows]] = {
     "run": _of_run, "report": _of_report, "comparison": _of_comparison, "diagnosis": _of_diagnosis,
+    "joint": _of_joint,
 }  # fmt: skip

@@ -280,13 +280,11 @@ def _score(validation: Validation, what: str) -> Mapping[str, Any]:
 
 def doubts_of(run: Path, label: str | None) -> list[str]:
     """Return the warnings of the verdicts that a folder keeps: of a group, or of all."""
-    from calib.data.files import read_json
-    from calib.inference.joint_files import JOINT
-    from calib.report.verdict import Verdict
+    from calib.report.verdict import joint_verdicts
 
-    kept: Mapping[str, Any] = read_json(run / JOINT).get("verdict", {})
+    kept = joint_verdicts(run)
     of = {k: v for k, v in kept.items() if label is None or k.endswith(f" {label}")}
-    said = (f"{place}: {w}" for place, v in of.items() for w in Verdict.of(v).warnings)
+    said = (f"{place}: {w}" for place, one in of.items() for w in one.warnings)
     return list(dict.fromkeys(said))
 
 

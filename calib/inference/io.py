@@ -149,6 +149,12 @@ def fault_of(folder: Path, fault: str) -> str:
     return fault if folder.exists() else "there is no such folder"
 
 
+_OF_JOINT = (
+    "of a joint calibration make a run of one output: in Python calib.save_calibration("
+    "load_joint(FOLDER).calibration(OUTPUT), RUN), with load_joint of calib.inference.joint_files"
+)
+
+
 def read_record[R: Record](kind: type[R], folder: Path) -> R:
     """Read the record of a kind in a folder.
 
@@ -163,7 +169,9 @@ def read_record[R: Record](kind: type[R], folder: Path) -> R:
             fault_of(folder, f"this is not a {kind.kind} folder (no readable {kind.FILE} in it)"),
             where=str(folder),
             expected=f"a folder written by `{kind.WRITTEN_BY}`",
-            hint=f"give the folder that `{kind.WRITTEN_BY} ... --out` named",
+            hint=_OF_JOINT
+            if (folder / "joint.json").is_file()
+            else f"give the folder that `{kind.WRITTEN_BY} ... --out` named",
         )
     try:
         content = json.loads(path.read_bytes())

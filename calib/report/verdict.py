@@ -27,6 +27,7 @@ from calib.errors import CalibError
 from calib.inference.calibration import Calibration
 from calib.inference.io import RUN
 from calib.inference.joint import NEW_GROUP
+from calib.inference.joint_files import JOINT
 from calib.inference.problem import Problem
 from calib.inference.random import generator
 from calib.models.base import Array
@@ -336,6 +337,12 @@ def kept_verdict(folder: Path) -> Verdict | None:
     """Return the verdict of a run folder, if it has one."""
     document = json.loads((folder / RUN).read_text(encoding="utf-8")).get("verdict")
     return None if document is None else Verdict.of(document)
+
+
+def joint_verdicts(folder: Path) -> dict[str, Verdict]:
+    """Return the verdicts of a joint folder, by output and group."""
+    kept = json.loads((folder / JOINT).read_text(encoding="utf-8")).get("verdict", {})
+    return {place: Verdict.of(document) for place, document in kept.items()}
 
 
 def gather(

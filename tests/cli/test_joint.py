@@ -57,8 +57,12 @@ def test_a_known_group_is_predicted_more_closely_than_a_new_one(calib: Calib, bi
 
 
 def test_a_folder_is_computed_again_and_what_was_changed_is_found(calib: Calib, bins: Path) -> None:
-    again = calib("check", bins)
+    again = calib("report", bins, "--reviewer", "--out", "review")
     assert again.code == 0, again.out
+    claimed = dict(json.loads(Path("review/review.json").read_text())["claimed"]["rows"])
+    assert claimed["rut_depth B"].startswith("fine")
+    assert "tau_z_ref" in claimed
+    assert_refused(calib("plan", bins, "--grid", "at.csv", "--budget", 2), ["not a run folder"])
     data = bins / "rut_depth.csv"
     data.write_text(data.read_text().replace("31.5", "35.1"))
     assert calib("check", bins, "--quick").code == 1
