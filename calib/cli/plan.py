@@ -117,8 +117,8 @@ def lines(chosen: NextTests, columns: Mapping[str, Any]) -> Iterator[str]:
         axis, then = axis_of(output), band * float(forecast["bands"][-1])
         yield (
             f"{axis.name}: from {axis.value_text(band)} to {axis.value_text(then)} {axis.unit} "
-            f"over {chosen.targets} condition{'s' if chosen.targets > 1 else ''}; the noise of a "
-            f"reading keeps its {axis.value_text(noise)} {axis.unit}."
+            f"over {chosen.targets} condition{'s' if chosen.targets > 1 else ''}; a "
+            f"reading's noise of {axis.value_text(noise)} {axis.unit} stays."
         )
     if chosen.halved:
         yield f"The band is half as wide after {chosen.halved} tests chosen in this way."
@@ -146,12 +146,9 @@ def remarks(chosen: NextTests) -> Iterator[str]:
         )
     if outside := sum(map(bool, chosen.outside)):
         lie = "test lies" if outside == 1 else "tests lie"
-        yield (
-            f"{outside} {lie} outside the calibrated range, where the model only guesses what they "
-            "tell"
-        )
+        yield (f"{outside} {lie} outside the calibrated range, where what they tell is a guess")
     if chosen.unreliable > 0.05:  # of twenty outcomes, more than one
         yield (
-            f"the simulation is rough: for {chosen.unreliable:.0%} of its outcomes too few draws "
-            "of the posterior come into question"
+            f"the simulation is rough: for {chosen.unreliable:.0%} of its outcomes too few "
+            "posterior draws carry weight"
         )
