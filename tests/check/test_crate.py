@@ -101,7 +101,7 @@ def test_what_nobody_should_publish_is_refused(calib: Calib, run: Path) -> None:
 
 
 @pytest.mark.skipif(not VALIDATOR.exists(), reason="no roc-validator here: `make crates`")
-@pytest.mark.parametrize("out", ["crate", "run.zip"])
+@pytest.mark.parametrize("out", ["crate", pytest.param("run.zip", marks=pytest.mark.slow)])
 def test_roc_validator_accepts_it(calib: Calib, run: Path, out: str) -> None:  # noqa: F811
     assert calib("export", run, *PACK, "--out", out).code == 0
     spec = find_spec("rocrate")

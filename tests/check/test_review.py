@@ -7,6 +7,8 @@ import re
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from calib.checking.check import Outcome, check
 from calib.checking.review import review
 from calib.models import example_csv
@@ -57,6 +59,7 @@ def test_without_a_folder_it_is_the_report_that_was_written_last(calib: Calib) -
     assert not Path("calib-review").exists()
 
 
+@pytest.mark.slow
 def test_what_other_folders_claim(tmp_path: Path) -> None:
     gap = gap_files("nominal_slip")
     found = review(gap, Outcome(str(gap), "diagnosis", True, (), {}))

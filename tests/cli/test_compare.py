@@ -48,6 +48,7 @@ def test_models_are_compared_and_the_stack_predicts(calib: Calib) -> None:
     assert "run `calib compare` again" in broken.err
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_one_figure")
 def test_a_report_has_it_as_a_section(calib: Calib) -> None:
     rows = [line.rpartition(",") for line in example_csv("reece").split()[1:]]

@@ -19,7 +19,7 @@ from tests.commands import Calib
 FEW = ["--max-steps", 100, "--workers", 1]
 QUICK = [
     "wismer_luth", "brixius", "reece", "bekker_plate", "lyasko", "janosi_hanamoto", "upadhyaya",
-    "elliptic_contact", "maclaurin_rut",
+    "elliptic_contact", "maclaurin_rut", "reece_plate",
 ]  # fmt: skip
 SLOW = ["wong_reece_pull", "wong_reece_torque", "wong_reece_sinkage"]
 PAPER = [
@@ -36,6 +36,7 @@ BESIDE = {
     "bekker_plate": "bekker", "lyasko": "modified_bekker", "wong_reece_pull": "wismer_luth",
     "wong_reece_sinkage": "lyasko", "upadhyaya": "magic_formula",
     "elliptic_contact": "upadhyaya", "maclaurin_rut": "bekker",
+    "reece_plate": "reece",
 }  # fmt: skip
 
 

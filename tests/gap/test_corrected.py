@@ -475,6 +475,7 @@ def test_the_correction_of_a_large_drift_predicts_new_conditions():
     assert after < 0.6 * before
 
 
+@pytest.mark.slow
 def test_without_fresh_conditions_the_rows_are_predicted_by_diagnoses_that_left_them_out():
     case = make_case("force_offset", models=PULL_ONLY, size={"offset": 0.12})
     few = {n: EFFECTS[n] for n in ("force_offset", "lug_thrust")}

@@ -27,6 +27,7 @@ def test_table_4_returns_to_every_digit_and_lies_in_the_posterior(audit: Audit) 
     )
 
 
+@pytest.mark.slow
 def test_a_misprint_is_told(audit: Audit) -> None:
     wrong = altered({"Table 4, 30 psi: D": "1.2071"}, audit.published)
     found = rows(4, replace(audit, published=wrong))["Table 4, 30 psi: D"]

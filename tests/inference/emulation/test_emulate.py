@@ -89,6 +89,7 @@ def test_a_budget_that_is_too_small_is_told() -> None:
     assert len(emulation.runs) <= 30
 
 
+@pytest.mark.slow
 def test_a_region_where_it_crashes_is_outside_the_posterior(tmp_path: Path) -> None:
     def crashing(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
         if theta[0, 0] > 0.6:

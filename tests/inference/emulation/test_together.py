@@ -141,6 +141,7 @@ def test_outputs_of_one_simulator_have_one_prior_each_parameter(tmp_path: Path) 
         emulated_jointly(joint, seed=1)
 
 
+@pytest.mark.slow
 def test_a_field_like_the_laboratory_needs_no_more_runs(tmp_path: Path) -> None:
     made = []
 
@@ -214,6 +215,7 @@ def crept() -> calib.Table:
     return calib.table_from_arrays({name: v[rows] for name, v in columns.items()})
 
 
+@pytest.mark.slow
 def test_series_have_the_likelihood_of_the_simulator_and_its_correlated_noise() -> None:
     calls = []
 
