@@ -13,8 +13,12 @@ from calib.errors import CalibError
 
 
 def import_(
-    file: Annotated[
-        Path, typer.Argument(help="CSV or text, a workbook, .mat up to version 7, or Parquet.")
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            help="CSV or text, a workbook, .mat up to version 7, or Parquet; several files of one "
+            "rig are put together, each with its number in a column run."
+        ),
     ],
     out: Annotated[
         Path, typer.Option("--out", "-o", help="CSV to write; a picture of it stands beside it.")
@@ -34,14 +38,18 @@ def import_(
     """Turn a rig's file into a CSV of calib's columns, by a mapping that you have seen."""
     from dataclasses import asdict
 
+    import numpy as np
+
     from calib.batch.folders import check_room
     from calib.data import write_table
     from calib.imports import read_log, suggest_mapping
 
-    image = out.with_suffix(".png")
-    for path in (out, image):
+    images = [out.with_suffix(".png")]
+    if len(files) > 1:
+        images = [out.with_name(f"{out.stem}_{i}.png") for i in range(1, len(files) + 1)]
+    for path in (out, *images):
         check_room(path)
-        given = [p.resolve() for p in (file, mapping) if p is not None]
+        given = [p.resolve() for p in (*files, mapping) if p is not None]
         if path.exists() and (path.resolve() in given or not overwrite):
             wrong, hint = "the file exists already", "choose another --out, or pass --overwrite"
             raise CalibError(wrong, where=str(path), hint=hint)
@@ -50,28 +58,38 @@ def import_(
         if mapping.exists():
             wrong, hint = "there is a mapping already", f"pass --mapping {mapping}, or delete it"
             raise CalibError(wrong, where=str(mapping), hint=hint)
-        text = suggest_mapping(file, sheet=sheet)
+        text = suggest_mapping(files[0], sheet=sheet)
         print(text)
         _write(mapping, text)
         if not yes:
             announce(f"nothing is imported yet: look at {mapping}, and run again with")
-            announce(f"  calib import {file} --mapping {mapping} --out {out}")
+            named = " ".join(map(str, files))
+            announce(f"  calib import {named} --mapping {mapping} --out {out}")
             finish(2, {"mapping": str(mapping)})
-    found = read_log(file, mapping)
+    found = [read_log(file, mapping) for file in files]
     from calib.report.figures.imported import imported_figure
     from calib.report.figures.style import png_bytes
 
-    drawn = png_bytes(imported_figure(found))
-    write_table(out, found.columns)
-    _write(image, drawn)
-    for line in found.report.lines():
-        print(line)
-    if found.report.warning:
-        announce(found.report.warning)
-    print(out, image, sep="\n")
-    finish(
-        0, {**asdict(found.report), "out": str(out), "picture": str(image), "mapping": str(mapping)}
-    )
+    drawn = [png_bytes(imported_figure(one)) for one in found]
+    columns = {n: np.concatenate([one.columns[n] for one in found]) for n in found[0].columns}
+    if len(found) > 1 and "run" not in columns:
+        columns["run"] = np.repeat(
+            np.arange(1, len(found) + 1), [one.report.rows_written for one in found]
+        )
+    write_table(out, columns)
+    reports = []
+    for i, (file, one, image) in enumerate(zip(files, found, images, strict=True), start=1):
+        _write(image, drawn[i - 1])
+        if len(files) > 1:
+            print(f"run {i}: {file}")
+        for line in one.report.lines():
+            print(line)
+        if one.report.warning:
+            announce(one.report.warning)
+        reports.append({**asdict(one.report), "picture": str(image)})
+    print(out, *images, sep="\n")
+    whole = {"runs": reports} if len(files) > 1 else reports[0]
+    finish(0, {**whole, "out": str(out), "mapping": str(mapping)})
 
 
 def _write(path: Path, content: str | bytes) -> None:

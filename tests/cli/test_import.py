@@ -76,3 +76,18 @@ def test_commands_that_refuse_a_rig_s_file_say_what_reads_it(calib: Calib, text:
     write(Path("rig.csv"), text)
     ran = calib("fit", "rig.csv", "--model", "magic_formula", "--out", "run")
     assert_refused(ran, ["calib import", "--out imported.csv"])
+
+
+def test_files_of_one_rig_are_put_together(calib: Calib) -> None:
+    for name in ("run7.dat", "run8.dat"):
+        write(Path(name), TTC)
+    calib("import", "run7.dat", "--out", "one.csv", "--yes")
+    both = ["import", "run7.dat", "run8.dat", "--mapping", "one.mapping.toml", "--out", "my.csv"]
+    ran = calib(*both)
+    assert (ran.code, ran.err) == (0, "")
+    assert "run 2: run8.dat" in ran.out
+    header, *rows = Path("my.csv").read_text(encoding="utf-8").splitlines()
+    assert header.endswith(",run")
+    assert [row.rpartition(",")[2] for row in rows] == ["1", "1", "2", "2"]
+    assert {"my_1.png", "my_2.png"} <= contents(Path())
+    assert_refused(calib(*both), ["the file exists already"])
