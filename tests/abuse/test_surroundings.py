@@ -81,6 +81,7 @@ def shell(command: str, **environment: str) -> subprocess.CompletedProcess[str]:
 # Terminals
 
 
+@pytest.mark.slow
 def test_a_limited_terminal_and_a_name_in_no_encoding_cost_nothing() -> None:
     """Files are in UTF-8 all the same."""
     name = os.fsdecode(b"r\xff.csv")
@@ -145,6 +146,7 @@ def test_an_interruption_loses_no_posterior(words: str, stage: str, kept: str) -
     assert np.isfinite(found.draws.t).all()
 
 
+@pytest.mark.slow
 def test_an_interrupted_diagnosis_that_was_made_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
     write_case(make_case("force_offset", models=PULL_ONLY, n_lab=15, n_field=12), Path("case"))
     monkeypatch.setattr("calib.report.page.diagnosis.write_page", interrupt)

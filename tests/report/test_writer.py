@@ -82,6 +82,7 @@ def test_pdfs_come_on_request_only(plate, tmp_path, monkeypatch):
     assert json.loads((report / "manifest.json").read_text())["pdf"] is False
 
 
+@pytest.mark.slow
 def test_made_again_it_is_the_same_to_the_last_byte(rut, report, tmp_path):
     """PDFs are made again in `figures/test_print.py`."""
     again = file_hashes(write(rut, tmp_path / "rep"))

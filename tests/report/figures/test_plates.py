@@ -210,6 +210,7 @@ def test_points_say_what_was_measured_and_expected_there(rut, density):
     assert any(s.startswith("Slip 20") and ", held out: measured" in s for s in said)
 
 
+@pytest.mark.slow
 def test_panels_are_stacked_for_narrow_screens(drawbar, density):
     for key, result, panels in (("drawbar_pull", drawbar, 3), ("bulk_density", density, 2)):
         files = draw(key, result).files
