@@ -139,6 +139,7 @@ def _parameters(calibration: Calibration, wanted: Wanted) -> Written:
     document = {
         "schema": "calib/draws/1", "model": model.name, "equation": model.equation,
         "output": model.output, "response": model.response, "conditions": list(model.conditions),
+        "letters": model.letters,
         "references": dict(problem.bound.references), "noise": asdict(problem.noise),
         "fixed": {p.name: p.loc for p in problem.priors.entries if p.fixed},
         "converged": calibration.converged, "data_label": problem.table.label, "draws": n,

@@ -117,8 +117,8 @@ def lines(chosen: NextTests, columns: Mapping[str, Any]) -> Iterator[str]:
         axis, then = axis_of(output), band * float(forecast["bands"][-1])
         yield (
             f"{axis.name}: from {axis.value_text(band)} to {axis.value_text(then)} {axis.unit} "
-            f"over {chosen.targets} condition{'s' if chosen.targets > 1 else ''}; a "
-            f"reading's noise of {axis.value_text(noise)} {axis.unit} stays."
+            f"over {chosen.targets} condition{'s' if chosen.targets > 1 else ''}; noise "
+            f"alone spreads readings over {axis.value_text(noise)} {axis.unit} (90 %)."
         )
     if chosen.halved:
         yield f"The band is half as wide after {chosen.halved} tests chosen in this way."

@@ -136,7 +136,7 @@ def _in_words(whole: Mapping[str, Any]) -> str:
     kinds = (
         f"{kind} {whole[kind]:.4g} (Monte Carlo error {whole[f'{kind}_error']:.1g})"
         if math.isfinite(whole[kind])
-        else f"{kind} unknown"
+        else f"{kind} unknown (readings are correlated along the run)"
         for kind in ("mean", "reading")
     )
     return f"probability of {whole['asked']} in all rows: {', '.join(kinds)}"

@@ -95,13 +95,16 @@ class Report:
         yield from (f"  {note}" for note in self.notes)
         yield from (f"  {name} from {of}" for name, of in self.columns.items())
         yield from (f"  not used: {', '.join(names)}" for names in [self.unused] if names)
-        left_out = {"a value is missing": self.rows_without_value, "cropped": self.rows_cropped}
+        left_out = {
+            "without a condition or any output": self.rows_without_value,
+            "cropped": self.rows_cropped,
+        }
         yield from (f"  left out, {why}: {n} rows" for why, n in left_out.items() if n)
         for name, time in self.autocorrelation_times.items():
             if time == time:
                 yield f"  autocorrelation time of {name}: {plain_number(time)} rows"
         if self.worth is not None:
-            yield f"  they are worth {self.worth} independent rows"
+            yield f"  worth {self.worth} independent rows"
         how = {
             "bins": f", means of {self.every} (the median)",
             "thinning": f", one of {self.every}",

@@ -243,12 +243,17 @@ class Prediction(Shown):
         They are evenly spaced among the 4000 that bands are made from. A CalibError says if noise
         is correlated along a column that the conditions do not have.
         """
+        return self._drawn(correlated=True).draws(size)
+
+    def _drawn(self, *, correlated: bool) -> Drawn:
+        """Draw mean and readings; the noise of the rows may be left independent."""
         conditions, means, readings = dict[str, Array](), [], []
         n = len(self._table)
         for _, _, found in _locations(self._parts, self._table, n):
             for part, at, location in found:
                 noise, back = part.problem.noise, part.problem.bound.from_response
-                order = serial_of(noise.correlated_along, self._table) if n > 1 else None
+                along = noise.correlated_along if correlated and n > 1 else ""
+                order = serial_of(along, self._table)
                 drawn = noise.draw(
                     part.natural, at, generator(part.seed, *part.labels, "draws"), n, order
                 )
@@ -257,11 +262,11 @@ class Prediction(Shown):
                 conditions |= at
         weights = _weights(self._parts)
         mean, reading = (Sample(np.concatenate(v), weights) for v in (means, readings))
-        return Drawn(conditions, mean, reading).draws(size)
+        return Drawn(conditions, mean, reading)
 
     def peak(self, over: str) -> Peak:
         """Find where the mean is largest along a condition; see `Drawn.peak`."""
-        return self.draws(N_DRAWS).peak(over)
+        return self._drawn(correlated=False).peak(over)  # of the mean, which has no noise
 
 
 def combine(
