@@ -99,6 +99,7 @@ def test_a_limited_terminal_and_a_name_in_no_encoding_cost_nothing() -> None:
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no full device")
+@pytest.mark.slow
 def test_where_printing_fails_files_are_written_and_the_exit_code_says_it() -> None:
     done = shell(f"calib {' '.join(FIT)} >/dev/full")
     assert (done.returncode, "Traceback" in done.stderr) == (2, False)

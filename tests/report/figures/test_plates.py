@@ -196,6 +196,7 @@ def test_a_figure_that_fails_does_not_stop_the_rest():
     assert found[1].caption == "drawn"
 
 
+@pytest.mark.slow
 def test_points_say_what_was_measured_and_expected_there(rut, density):
     """Where they lie in the image: within it, to the right with slip."""
     for key, result in (("rut_depth", rut), ("bulk_density", density)):

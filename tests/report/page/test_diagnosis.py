@@ -112,6 +112,7 @@ def in_own_units(case: Case, folder: Path) -> Case:
     return read_case(folder)
 
 
+@pytest.mark.slow
 def test_a_folder_is_in_the_units_of_the_files_checks_and_is_rendered_again(tmp_path):
     few = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift")}
     found = diagnose(in_own_units(make_case("sensor_drift", n_fresh=3), tmp_path / "own"), 1,
