@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import io
 import re
+import tempfile
 from collections.abc import Mapping, Sequence
 from datetime import date
 from pathlib import Path, PurePosixPath
 from typing import Any
+from zipfile import ZIP_DEFLATED, ZipFile
 
 from calib.batch.environment import sha256
 from calib.batch.folders import fresh_folder, writing
@@ -147,7 +149,11 @@ def write_crate(
         crate.root_dataset["author"] = crate.publisher = _one(people)
     with writing(out):
         if out.suffix == ".zip":
-            crate.write_zip(out)
+            with tempfile.TemporaryDirectory(prefix="calib-crate-") as scratch:
+                crate.write(scratch)
+                with ZipFile(out, "w", ZIP_DEFLATED) as packed:
+                    for path in sorted(p for p in Path(scratch).rglob("*") if p.is_file()):
+                        packed.write(path, path.relative_to(scratch))
         else:
             with fresh_folder(out) as whole:
                 crate.write(whole)

@@ -14,10 +14,11 @@ from calib.cli.options import emulate, finish, progress_bars, say_failed
 from calib.errors import CalibError
 
 if TYPE_CHECKING:
-    from calib.inference.calibration import Calibration
+    from calib.inference.calibration import Calibration, ParameterSummary
     from calib.inference.emulation import Emulation
     from calib.report.sections import Section
     from calib.report.verdict import Verdict
+    from calib.validation.validate import Validation
 
 
 def report(
@@ -212,7 +213,6 @@ def fit(
     from calib.batch.folders import claimed, fresh_folder, keep
     from calib.inference.random import generator
     from calib.models import get_model
-    from calib.report.numbers import format_number
     from calib.report.study import HoldOut, read_and_split, validated
     from calib.report.verdict import keep_verdict, verdict
     from calib.validation.comparison import noise_preference
@@ -261,9 +261,8 @@ def fit(
         ninety = scores.coverage[0.9]
         rough = 0 if k is None else int((k > PARETO_K_MAX).sum())
         print(
-            f"{'left out one by one' if held is None else f'held out ({kept})'}: 90 % band covers "
-            f"{ninety.hits} of {ninety.n}, RMSE {format_number(scores.rmse)}, "
-            f"CRPS {format_number(scores.crps)}"
+            f"{'left out one by one' if held is None else f'held out ({kept})'}: "
+            f"{scored(validation)}"
             + (f" ({rough} of them roughly: `calib report` fits without each)" if rough else "")
         )
         found["left_out" if held is None else "held_out"] = {
@@ -348,24 +347,45 @@ def compare(
 
 def posterior_table(calibration: Calibration, judged: Verdict) -> None:
     """Print a calibration's posterior as a table, in agreement with its verdict."""
-    from rich.table import Table as RichTable
-
-    from calib.report.numbers import centre_text, interval_text
     from calib.validation.assumptions import parameter_remarks
 
     problem = calibration.problem
-    table = RichTable(title=f"{problem.bound.model.name}: posterior of {len(problem.table)} rows")
+    title = f"{problem.bound.model.name}: posterior of {len(problem.table)} rows"
+    print_posterior(
+        title, calibration.summary, "remark", parameter_remarks(calibration, judged.remarks)
+    )
+
+
+def print_posterior(
+    title: str, summary: Mapping[str, ParameterSummary], last: str, words: Mapping[str, str]
+) -> None:
+    """Print summaries of parameters as a table, with words on each in a last column."""
+    from rich.table import Table as RichTable
+
+    from calib.report.numbers import centre_text, interval_text
+
+    table = RichTable(title=title)
     for heading in ("parameter", "unit"):
         table.add_column(heading)
     for heading in ("mean ± sd or median", "95 % HDI", "ESS bulk/tail", "R-hat"):
         table.add_column(heading, justify="right")
-    table.add_column("remark")
-    remarks = parameter_remarks(calibration, judged.remarks)
-    for s in calibration.summary.values():
+    table.add_column(last)
+    for s in summary.values():
         ess = f"{s.ess_bulk:.0f}/{s.ess_tail:.0f}"
         numbers = (centre_text(s), interval_text(s), ess, f"{s.rhat:.3f}")
-        table.add_row(s.name, s.unit, *numbers, remarks[s.name])
+        table.add_row(s.name, s.unit, *numbers, words.get(s.name, ""))
     opt.wide_console(120).print(table)
+
+
+def scored(validation: Validation) -> str:
+    """Say how well unseen rows were predicted."""
+    from calib.report.numbers import format_number
+
+    scores, ninety = validation.scores, validation.scores.coverage[0.9]
+    return (
+        f"90 % band covers {ninety.hits} of {ninety.n}, RMSE {format_number(scores.rmse)}, "
+        f"CRPS {format_number(scores.crps)}"
+    )
 
 
 def tell_verdict(found: Verdict, of: str = "") -> None:

@@ -118,6 +118,7 @@ def export(
 def _parameters(calibration: Calibration, wanted: Wanted) -> Written:
     """Return draws of all parameters that vary, sampled and published, evenly spaced."""
     from calib.data.files import table_csv
+    from calib.report.markup import to_text
 
     if wanted.at or wanted.each:
         raise CalibError(
@@ -139,7 +140,7 @@ def _parameters(calibration: Calibration, wanted: Wanted) -> Written:
     document = {
         "schema": "calib/draws/1", "model": model.name, "equation": model.equation,
         "output": model.output, "response": model.response, "conditions": list(model.conditions),
-        "letters": model.letters,
+        "letters": to_text(model.letters),
         "references": dict(problem.bound.references), "noise": asdict(problem.noise),
         "fixed": {p.name: p.loc for p in problem.priors.entries if p.fixed},
         "converged": calibration.converged, "data_label": problem.table.label, "draws": n,

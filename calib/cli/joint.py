@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from calib.cli import options as opt
-from calib.cli.calibration import tell_verdict
+from calib.cli.calibration import print_posterior, scored, tell_verdict
 from calib.cli.options import emulate_jointly, finish, progress_bars
 from calib.errors import CalibError
 
@@ -66,11 +66,12 @@ def joint(
     json: opt.Json = False,
 ) -> None:  # fmt: skip
     """Calibrate outputs that share parameters, or groups that are alike, in one posterior."""
+    from dataclasses import asdict
     from functools import partial
 
     from calib.batch.folders import claimed, fresh_folder
     from calib.inference.joint import build_joint, calibrate_joint
-    from calib.inference.joint_files import JOINT, save_joint, stated
+    from calib.inference.joint_files import JOINT, save_joint
     from calib.inference.prior_files import prior_file_model
     from calib.inference.sampler import SamplerSettings
 
@@ -79,12 +80,11 @@ def joint(
     fitted, held = _split(rows, hold_out, group)
     given = {prior_file_model(path): path for path in priors or ()}
     build = partial(build_joint, group=group, pooled=pool or (), priors=given)
+    problem = build(fitted)
     if dry_run:
-        problem = build(fitted)
         left = {m: len(held[m]) if m in held else 0 for m in model}
         opt.planned(problem.wholes.values(), left, out)
         return
-    problem = build(fitted)
     if emulations := emulate_jointly(problem, seed, workers, [*held.values()]):
         problem = build(fitted)
     with progress_bars() as tell:
@@ -97,7 +97,9 @@ def joint(
         save_joint(found, folder, verdicts={k: v.document() for k, v in judged.items()})
     for line in _headlines(problem):
         print(line)
-    _table(found)
+    readings = sum(len(whole.table) for whole in problem.wholes.values())
+    shared = {name: ", ".join(of) for name, of in problem.shared.items()}
+    print_posterior(f"joint posterior of {readings} readings", found.summary, "in", shared)
     gate = found.draws.report
     if gate.passed:
         print(f"converged: {gate.steps} steps, R-hat at most {gate.rhat.max():.4f}")
@@ -112,7 +114,7 @@ def joint(
     print(f"folder: {out}")
     print(f"next: calib predict {out} --at CONDITIONS.csv")
     good = found.converged and all(e.passed for e in emulations.values())
-    posterior = stated(found)
+    posterior = {name: asdict(s) for name, s in found.summary.items()}
     finish(0 if good else 3, out / JOINT, folder=str(out), posterior=posterior, scores=scores)
 
 
@@ -132,7 +134,7 @@ def _rows(file: Path, models: Sequence[str], data: Sequence[str]) -> dict[str, T
             )  # fmt: skip
         own[name] = Path(path)
     if len(set(models)) < len(models):
-        raise CalibError("a model is there twice", where="--model", hint="name each once")
+        raise CalibError("a model is named twice", where="--model", hint="name each once")
     found = {}
     for name in models:
         chosen, outputs = get_model(name), set(OUTPUTS.values())
@@ -176,7 +178,7 @@ def _split(
             fitted[model], held[model] = kept.split(table)
     if not held:
         raise CalibError(
-            "no data have this column", where=f"--hold-out {hold_out}",
+            "none of the files has this column", where=f"--hold-out {hold_out}",
             expected="a column of the data", hint="name a column with its unit, or the groups'",
         )  # fmt: skip
     return fitted, held
@@ -194,26 +196,6 @@ def _headlines(problem: JointProblem) -> list[str]:
             f"({problem.column})"
         )
     return found
-
-
-def _table(found: JointCalibration) -> None:
-    """Print the joint posterior."""
-    from rich.table import Table as RichTable
-
-    from calib.report.numbers import centre_text, interval_text
-
-    rows = sum(len(whole.table) for whole in found.problem.wholes.values())
-    table = RichTable(title=f"joint posterior of {rows} readings")
-    for heading in ("parameter", "unit"):
-        table.add_column(heading)
-    for heading in ("mean ± sd or median", "95 % HDI", "ESS bulk/tail", "R-hat"):
-        table.add_column(heading, justify="right")
-    table.add_column("in")
-    for s in found.summary.values():
-        ess = f"{s.ess_bulk:.0f}/{s.ess_tail:.0f}"
-        numbers = (centre_text(s), interval_text(s), ess, f"{s.rhat:.3f}")
-        table.add_row(s.name, s.unit, *numbers, ", ".join(found.problem.shared.get(s.name, ())))
-    opt.wide_console(120).print(table)
 
 
 def _judged(
@@ -268,13 +250,10 @@ def _by_place(held: Mapping[str, Table], problem: JointProblem) -> dict[tuple[st
 
 
 def _score(validation: Validation, what: str) -> Mapping[str, Any]:
-    from calib.report.numbers import format_number
-
     scores, ninety = validation.scores, validation.scores.coverage[0.9]
     return {
         "rows": ninety.n, "covered_90": ninety.hits, "rmse": scores.rmse, "crps": scores.crps,
-        "sentence": f"{what}: 90 % band covers {ninety.hits} of {ninety.n}, "
-        f"RMSE {format_number(scores.rmse)}, CRPS {format_number(scores.crps)}",
+        "sentence": f"{what}: {scored(validation)}",
     }  # fmt: skip
 
 

@@ -84,7 +84,7 @@ def plan(
     if out is not None:
         empty = {known.header_of(name): [""] * len(chosen.table) for name in chosen.outputs}
         write_table(out, {**columns, **empty})
-        print(f"to fill in: {out}")
+        print(f"fill in the results: {out}")
     document = {name: value for name, value in vars(chosen).items() if name != "table"} | {
         "tests": columns, "cost": chosen.cost.tolist(),
         "forecast": {name: values.tolist() for name, values in chosen.forecast.items()},
@@ -123,7 +123,7 @@ def lines(chosen: NextTests, columns: Mapping[str, Any]) -> Iterator[str]:
     if chosen.halved:
         yield f"The band is half as wide after {chosen.halved} tests chosen in this way."
     elif chosen.aim == "bands":
-        yield f"{MOST_TESTS} tests do not halve the band: they leave {percent(chosen.left)}."
+        yield f"Even {MOST_TESTS} tests would leave {percent(chosen.left)} of the band's width."
     found: dict[str, Sequence[Any]] = {"test": range(1, n + 1), **columns}
     found |= {f"{name} %": [f"{100.0 * v:.1f}" for v in forecast[name][1:]] for name in forecast}
     found["outside the calibrated range"] = [

@@ -29,7 +29,8 @@ def diagnose(
     case: Annotated[
         Path | None,
         typer.Argument(
-            help="Folder with a case.toml; its table [context] holds what you suspect or rule out."
+            help="Folder with a case.toml, whose table \\[context] says what you suspect or rule "
+            "out."
         ),
     ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")] = Path(

@@ -72,8 +72,8 @@ class Asked:
         if draws and out is None:
             raise CalibError("draws are written beside a file", hint="add --out FILE.csv")
         if over and (limits or levels or draws):
-            found = "--peak-over asks of curves, the other questions of rows"
-            raise CalibError(found, hint="ask one after the other")
+            found = "--peak-over cannot be combined with other questions"
+            raise CalibError(found, hint="run calib predict once for each")
         return cls(limits, levels, draws, over or "")
 
     @property
@@ -136,7 +136,8 @@ def _in_words(whole: Mapping[str, Any]) -> str:
     kinds = (
         f"{kind} {whole[kind]:.4g} (Monte Carlo error {whole[f'{kind}_error']:.1g})"
         if math.isfinite(whole[kind])
-        else f"{kind} unknown (readings are correlated along the run)"
+        else f"{kind} not known for all rows at once, as readings of a run are correlated (each "
+        "row's own probability is in the table)"
         for kind in ("mean", "reading")
     )
     return f"probability of {whole['asked']} in all rows: {', '.join(kinds)}"
@@ -149,7 +150,7 @@ def _named(header: str, names: Sequence[str]) -> Column:
     column = parse_header(header)
     if column is None or column.quantity.canonical not in names:
         raise CalibError(
-            f"there is no {header} here", expected=", ".join(names),
+            f"there is no column {header} here", expected=", ".join(names),
             hint="name one of these, in any unit",
         )  # fmt: skip
     return column

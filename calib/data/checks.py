@@ -398,7 +398,8 @@ def hold_out(
     Raises
     ------
     CalibError
-        If no row has such a value, listing those present, or if every row has one.
+        If no row has such a value, listing those present, if every row has one, or if the value
+        scatters, as a gauge's does, so that rows nearly at it would be fitted.
 
     Examples
     --------
@@ -429,12 +430,23 @@ def hold_out(
         )  # fmt: skip
     values = table[column.quantity.canonical]
     largest, absent = float(np.nanmax(np.abs(values))), []
-    held = np.zeros(len(table), dtype=bool)
+    held, near = np.zeros((2, len(table)), dtype=bool)
     for one in wanted:
         at = float(column.to_canonical(one))
-        here = np.abs(values - at) <= rel_tol * (abs(at) or largest)
+        apart, size = np.abs(values - at), rel_tol * (abs(at) or largest)
+        here = apart <= size
         held |= here
+        near |= (apart <= 10.0 * size) & (at != 0.0)
         absent += [] if here.any() else [f"{one:g}"]
+    if not absent and (near & ~held).any():
+        left = column.written(values[near & ~held])
+        raise CalibError(
+            f"rows nearly at the value, such as {float(left[0]):.6g}, would be fitted: "
+            f"{len(left)}, beside {int(held.sum())} held out",
+            where=f"{table.source}, column {quantity_header!r}",
+            expected="a value that is set, and the same in all rows of a test",
+            hint="hold out by run (a column run that numbers the tests), or round the column",
+        )  # fmt: skip
     if not absent and not held.all():
         return table.take(~held), table.take(held)
     where = f"{table.source}, column {quantity_header!r}"

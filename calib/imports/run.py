@@ -36,6 +36,8 @@ class Report:
         The file, and the hash of its bytes.
     notes : tuple of str
         How it was read.
+    doubts : tuple of str
+        What the file contradicts in the mapping.
     columns : mapping of str to str
         By column that is written the columns of the file that it is made of.
     unused : tuple of str
@@ -60,6 +62,7 @@ class Report:
     source: str
     sha256: str
     notes: tuple[str, ...]
+    doubts: tuple[str, ...]
     columns: Mapping[str, str]
     unused: tuple[str, ...]
     rows_read: int
@@ -79,11 +82,14 @@ class Report:
 
     @property
     def warning(self) -> str:
-        """What to do if the rows that are written are not independent; empty if they are."""
+        """What is doubtful, and what to do if rows are not independent; empty if all is well."""
+        return "; ".join([*self.doubts, *self._dependent()])
+
+    def _dependent(self) -> Iterator[str]:
         if self.apart <= self.every:
-            return ""
+            return
         done = {"bins": f"means of {self.every} are", "thinning": f"one of {self.every} is"}
-        return (
+        yield (
             f"neighbouring rows are alike: independent ones are {self.apart} apart, and "
             f'{done.get(self.reduced_by, "all are")} written: thin (every = "auto" in [thin]), use '
             "wider bins, or write correlated_along in the prior file"
@@ -102,12 +108,12 @@ class Report:
         yield from (f"  left out, {why}: {n} rows" for why, n in left_out.items() if n)
         for name, time in self.autocorrelation_times.items():
             if time == time:
-                yield f"  autocorrelation time of {name}: {plain_number(time)} rows"
+                yield f"  autocorrelation time of {name}: at least {plain_number(time)} rows"
         if self.worth is not None:
-            yield f"  worth {self.worth} independent rows"
+            yield f"  worth at most {self.worth} independent rows"
         how = {
-            "bins": f", means of {self.every} (the median)",
-            "thinning": f", one of {self.every}",
+            "bins": f", means of {self.every} (the median); predictions are of such means too",
+            "thinning": f", one in {self.every}, numbered in run_order",
         }
         yield f"  {self.rows_written} rows written{how.get(self.reduced_by, '')}"
 
@@ -217,10 +223,14 @@ def apply(raw: RawTable, mapped: Mapped, where: str = "mapping") -> Imported:
     elif mapped.thin:
         every = rows_apart(times) if mapped.thin.every == "auto" else mapped.thin.every
         left = (runs.groupby(runs.to_numpy()).cumcount() % every == 0).to_numpy()
-        written, table = rows[left], table.take(left)
+        written = rows[left]
+        if "run_order" not in rows:
+            # One continuous run is thinned: its rows come as they were measured.
+            written = written.assign(run_order=np.arange(1, len(written) + 1))
+        table = _table(written, raw)
     longest = max((t for t in times.values() if t == t), default=None)
     report = Report(
-        raw.source, raw.sha256, tuple(raw.notes), read.words,
+        raw.source, raw.sha256, tuple(raw.notes), tuple(read.doubts), read.words,
         tuple(str(n) for n in raw.frame if n not in read.used), len(whole),
         int((~there).sum()), int((there & ~inside).sum()), int(runs.nunique()), times,
         None if longest is None else round(len(rows) / longest), by, every, len(written),
@@ -280,9 +290,16 @@ class _Read:
         self.columns: dict[str, NDArray[Any]] = {}
         self.words: dict[str, str] = {}
         self.used: set[str] = set()
+        self.doubts: list[str] = []
         for name, source in mapped.columns.items():
             try:
-                self.targets[name] = parse_header(name)
+                self.targets[name] = target = parse_header(name)
+                if source.derive == "kappa" and not (target is None or target.kappa):
+                    raise CalibError(
+                        "kappa is the slip ωr/v - 1, and this column another",
+                        expected="slip_kappa_ratio or slip_kappa_percent",
+                        hint='rename the column, or write derive = "slip"',
+                    )  # fmt: skip
                 self.columns[name] = self._column(source, self.targets[name])[self.order]
             except CalibError as error:
                 raise error.within(f"{where}, columns.{name}") from None
@@ -334,6 +351,11 @@ class _Read:
         values = source.factor * self._cells(source, numbers=True)
         names = _names(source)
         unit = source.unit or next((self.raw.units[n] for n in names if n in self.raw.units), "")
+        own = self.raw.units.get(names[0], "") if source.unit and names else ""
+        if own and not _same_size(source.unit, own, known, wanted):
+            self.doubts.append(
+                f"{names[0]} is read in {source.unit}, as the mapping says; the file says {own}"
+            )
         if unit or bare:
             return to_unit(values, unit, known, wanted) if unit else convert(values, bare, wanted)
         raise CalibError(
@@ -374,6 +396,15 @@ class _Read:
         parts = [frame[n] for n in names] or [pd.Series([source.value] * len(frame))]
         cells = pd.concat(parts * (self.repeats // len(parts)), ignore_index=True)
         return np.asarray(pd.to_numeric(cells), dtype=np.float64) if numbers else cells.to_numpy()
+
+
+def _same_size(unit: str, other: str, known: Mapping[str, str], wanted: str) -> bool:
+    """Whether two spellings are of units of one size and dimension."""
+    try:
+        one, two = (float(to_unit(np.ones(1), u, known, wanted)[0]) for u in (unit, other))
+    except CalibError:
+        return False
+    return bool(np.isclose(one, two, rtol=1e-9))
 
 
 def _plain(value: object) -> str:

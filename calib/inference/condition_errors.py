@@ -130,7 +130,7 @@ class ConditionError:
         said += f"error {size} (sd), which the likelihood allows for"
         if self.set_point:
             return said
-        return f"{said}: {self.reliability:.3g} of its variance is of true differences"
+        return f"{said}; {self.reliability:.1%} of its variance is true variation"
 
 
 def errors_of(

@@ -57,6 +57,8 @@ from calib.models.simulators.emulator import (
 if TYPE_CHECKING:
     import xarray as xr
 
+    from calib.inference.joint_files import JointRecord
+
 
 RUN, POSTERIOR, PRIORS, DATA = "run.json", "posterior.nc", "priors.toml", "data.csv"
 
@@ -200,7 +202,7 @@ DRAWN = ("chain", "draw")
 _EMULATOR = "emulator.npz"
 # What `run.json` has of the draws and of the gate's report under their own names.
 _OF_DRAWS = ("log_evidence", "efficiency", "acceptance", "evaluations")
-GATE_NUMBERS = ("rhat", "ess_bulk", "ess_tail", "tau")
+_OF_GATE = ("rhat", "ess_bulk", "ess_tail", "tau")
 
 
 @takes(calibration=Calibration)
@@ -289,7 +291,11 @@ def save_posterior(calibration: Calibration, path: Path) -> None:
     OSError
         If the disk has no room for it, before anything is written.
     """
-    tree = to_datatree(calibration)
+    write_netcdf(to_datatree(calibration), path)
+
+
+def write_netcdf(tree: xr.DataTree, path: Path) -> None:
+    """Write a DataTree; an OSError, before anything is written, if the disk has no room for it."""
     # HDF5 does not survive a disk that fills up while it writes.
     if shutil.disk_usage(path.parent).free < tree.nbytes:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
@@ -378,14 +384,27 @@ def _describe(calibration: Calibration) -> dict[str, Any]:
         # Units are shown as in the file, of which the copy has other names.
         **own_names(problem.table),
         **({"part_of": calibration.part_of} if calibration.part_of else {}),
-        "gate": {
-            "passed": report.passed,
-            "reasons": list(report.reasons),
-            "steps": report.steps,
-            "names": list(report.names),
-            **{k: getattr(report, k).tolist() for k in GATE_NUMBERS},
-        },
+        "gate": describe_gate(report),
     }
+
+
+def describe_gate(report: GateReport) -> dict[str, Any]:
+    """Return a gate's report as JSON has it."""
+    return {
+        "passed": report.passed,
+        "reasons": list(report.reasons),
+        "steps": report.steps,
+        "names": list(report.names),
+        **{k: getattr(report, k).tolist() for k in _OF_GATE},
+    }
+
+
+def read_gate(gate: Mapping[str, Any]) -> GateReport:
+    """Return the report that `describe_gate` described."""
+    return GateReport(
+        names=tuple(gate["names"]), steps=gate["steps"], passed=gate["passed"],
+        reasons=tuple(gate["reasons"]), **{k: np.array(gate[k]) for k in _OF_GATE},
+    )  # fmt: skip
 
 
 def describe_estimates(estimates: Sequence[PointEstimate]) -> list[dict[str, Any]]:
@@ -469,39 +488,38 @@ def load_calibration(folder: Path) -> Calibration:
     folder = Path(folder)
     record = read_record(RunRecord, folder)
     meta: dict[str, Any] = record.document
-    # A run is predicted from only as it was written.
-    for name, expected in record.sha256.items():
-        with _damage(folder / name):
-            content = (folder / name).read_bytes()
-        if (found := sha256(content)) != expected and not differs_in_lines(content, expected):
-            raise CalibError(
-                "the file has changed since the run was written",
-                where=str(folder / name),
-                expected=f"SHA-256 {expected[:16]}..., found {found[:16]}...",
-                hint="restore it, or run `calib fit` again",
-            )
-    with _damage(folder / RUN):
+    check_unchanged(folder, record)
+    with damage(folder / RUN):
         problem = run_problem(record, folder / DATA)
         shape = tuple(meta["shape"])
-    with _damage(folder / POSTERIOR):
+    with damage(folder / POSTERIOR):
         file, priors = read_draws(folder / POSTERIOR), problem.priors
         natural, log_prob = priors.stack(file.draws, shape[:-1]), file.log_prob.reshape(shape[:-1])
         t = priors.to_internal(natural.reshape(-1, natural.shape[-1]), margin=0.0).reshape(shape)
-    with _damage(folder / RUN):
+    with damage(folder / RUN):
         _check_model(problem, t, log_prob, folder)
-        gate = meta["gate"]
-        report = GateReport(
-            names=tuple(gate["names"]), steps=gate["steps"], passed=gate["passed"],
-            reasons=tuple(gate["reasons"]), **{k: np.array(gate[k]) for k in GATE_NUMBERS},
-        )  # fmt: skip
         draws = Draws(
-            t=t, log_prob=log_prob, report=report, mode=np.array(meta["mode"]),
+            t=t, log_prob=log_prob, report=read_gate(meta["gate"]), mode=np.array(meta["mode"]),
             walkers=meta.get("walkers", t.shape[1]),  # earlier run folders had all stored
             **{k: meta[k] for k in (*_OF_DRAWS, "seconds")},
         )  # fmt: skip
         calibration = Calibration(problem, draws, record.seed, record.label, part_of=record.part_of)
         _ = calibration.parameters  # what cannot be reported is damaged as well
         return calibration
+
+
+def check_unchanged(folder: Path, record: RunRecord | JointRecord) -> None:
+    """A folder is predicted from only as it was written; a CalibError names a file that changed."""
+    for name, expected in record.sha256.items():
+        with damage(folder / name, record.WRITTEN_BY):
+            content = (folder / name).read_bytes()
+        if (found := sha256(content)) != expected and not differs_in_lines(content, expected):
+            raise CalibError(
+                "the file has changed since the run was written",
+                where=str(folder / name),
+                expected=f"SHA-256 {expected[:16]}..., found {found[:16]}...",
+                hint=f"restore it, or run `{record.WRITTEN_BY}` again",
+            )
 
 
 def _check_model(problem: Problem, t: Array, log_prob: Array, folder: Path) -> None:
@@ -523,15 +541,16 @@ def _check_model(problem: Problem, t: Array, log_prob: Array, folder: Path) -> N
 
 
 @contextmanager
-def _damage(path: Path) -> Iterator[None]:
+def damage(path: Path, by: str = "calib fit") -> Iterator[None]:
+    """Turn what a damaged file makes fail into a CalibError that names it."""
     try:
         yield
     except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise CalibError(
             f"the file cannot be read ({type(error).__name__})",
             where=str(path),
-            expected="the file as `calib fit` wrote it",
-            hint="the file is damaged or incomplete: run `calib fit` again",
+            expected=f"the file as `{by}` wrote it",
+            hint=f"the file is damaged or incomplete: run `{by}` again",
         ) from None
 
 

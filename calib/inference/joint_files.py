@@ -7,10 +7,7 @@ values of the groups have a dimension `group`.
 
 from __future__ import annotations
 
-import errno
 import json
-import os
-import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -19,15 +16,13 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from calib.batch.environment import Environment, differs_in_lines, sha256
+from calib.batch.environment import Environment, sha256
 from calib.batch.folders import check_folder
 from calib.data import read_for_model, write_table
 from calib.data.quantities import OUTPUTS
-from calib.errors import FAULTS, CalibError
-from calib.inference.diagnostics import GateReport
+from calib.errors import CalibError
 from calib.inference.io import (
     DRAWN,
-    GATE_NUMBERS,
     POSTERIOR,
     DrawsFile,
     Entry,
@@ -35,9 +30,14 @@ from calib.inference.io import (
     Hash,
     KnownModel,
     Record,
+    check_unchanged,
+    damage,
+    describe_gate,
     own_names,
+    read_gate,
     read_netcdf,
     read_record,
+    write_netcdf,
 )
 from calib.inference.joint import JointCalibration, JointProblem, build_joint, calibrate_joint
 from calib.inference.sampler import Draws
@@ -45,6 +45,7 @@ from calib.models.base import Array
 from calib.models.simulators.emulator import emulator_of, save_emulator
 
 JOINT = "joint.json"
+_OF_DRAWS = ("acceptance", "evaluations", "walkers", "seconds")
 
 
 class OutputRecord(Entry):
@@ -104,11 +105,8 @@ def save_joint(
         "seed": calibration.seed,
         "settings": asdict(calibration.settings),
         "shape": list(draws.t.shape),
-        **{k: getattr(draws, k) for k in ("acceptance", "evaluations", "walkers", "seconds")},
-        "gate": {
-            "passed": report.passed, "reasons": list(report.reasons), "steps": report.steps,
-            "names": list(report.names), **{k: getattr(report, k).tolist() for k in GATE_NUMBERS},
-        },
+        **{k: getattr(draws, k) for k in _OF_DRAWS},
+        "gate": describe_gate(report),
         **({} if verdicts is None else {"verdict": verdicts}),
         **(environment or Environment.here()).document(),
         "sha256": {p.relative_to(folder).as_posix(): sha256(p.read_bytes()) for p in files},
@@ -134,10 +132,7 @@ def _save_posterior(calibration: JointCalibration, path: Path) -> None:
     stats = xr.Dataset({"lp": (DRAWN, draws.log_prob.reshape(shape))})
     tree = xr.DataTree.from_dict({"posterior": posterior, "sample_stats": stats})
     tree.attrs["run"] = json.dumps({"shape": list(draws.t.shape)})
-    # HDF5 does not survive a disk that fills up while it writes.
-    if shutil.disk_usage(path.parent).free < tree.nbytes:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
-    tree.to_netcdf(path, engine="h5netcdf")
+    write_netcdf(tree, path)
 
 
 def read_joint_draws(path: Path) -> DrawsFile:
@@ -195,34 +190,16 @@ def load_joint(folder: Path) -> JointCalibration:
 
     load_files(sorted((folder / "emulators").glob("*.npz")))
     record = read_record(JointRecord, folder)
-    for name, expected in record.sha256.items():
-        path = folder / name
-        content = path.read_bytes() if path.is_file() else b""
-        if sha256(content) != expected and not differs_in_lines(content, expected):
-            raise CalibError(
-                "the file has changed since it was written, or is not there", where=str(path),
-                expected="the file as `calib joint` wrote it",
-                hint="restore it, or run `calib joint` again",
-            )  # fmt: skip
+    check_unchanged(folder, record)
     problem = joint_problem(record, folder)
     meta: dict[str, Any] = record.document
-    try:
+    with damage(folder / POSTERIOR, record.WRITTEN_BY):
         file, shape = read_joint_draws(folder / POSTERIOR), tuple(meta["shape"])
-        t, gate = coordinates_of(problem, file), meta["gate"]
-        report = GateReport(
-            names=tuple(gate["names"]), steps=gate["steps"], passed=gate["passed"],
-            reasons=tuple(gate["reasons"]), **{k: np.array(gate[k]) for k in GATE_NUMBERS},
-        )  # fmt: skip
-        log_prob = file.log_prob.reshape(shape[:-1])
+        t, log_prob = coordinates_of(problem, file), file.log_prob.reshape(shape[:-1])
         draws = Draws(
-            t.reshape(shape), log_prob, report, t[int(np.argmax(log_prob))], np.nan, np.nan,
-            **{k: meta[k] for k in ("acceptance", "evaluations", "seconds", "walkers")},
+            t.reshape(shape), log_prob, read_gate(meta["gate"]), t[int(np.argmax(log_prob))],
+            np.nan, np.nan, **{k: meta[k] for k in _OF_DRAWS},
         )  # fmt: skip
-    except FAULTS as error:
-        raise CalibError(
-            f"the file cannot be read ({type(error).__name__})", where=str(folder / POSTERIOR),
-            expected="the file as `calib joint` wrote it", hint="run `calib joint` again",
-        ) from None  # fmt: skip
     if density_differs(problem, t, file):
         raise CalibError(
             "the models no longer give the draws the densities that they were saved with: a "
@@ -258,8 +235,3 @@ def recompute_joint(
     )  # fmt: skip
     save_joint(found, out, environment=record.environment)
     return found
-
-
-def stated(calibration: JointCalibration) -> Mapping[str, Any]:
-    """Return the posterior summary of a joint calibration as plain dictionaries."""
-    return {name: asdict(s) for name, s in calibration.summary.items()}

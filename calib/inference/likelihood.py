@@ -423,7 +423,8 @@ def serial_of(along: Along, table: Table) -> Serial | None:
         return None
     if along not in table:
         raise CalibError(
-            f"the noise is to be correlated along {along}, a column that is not there",
+            f"the prior file asks for noise that is correlated along {along}, and the data have no "
+            "such column",
             where=table.source, expected=f"a column {along}",
             hint="add the column, with whole numbers in the order of the measurement",
         )  # fmt: skip
@@ -433,7 +434,7 @@ def serial_of(along: Along, table: Table) -> Serial | None:
     gap = np.full(n, np.inf)
     gap[1:] = np.where(np.diff(run[order]) == 0.0, np.diff(place[order]), np.inf)
     # An empty cell is neither.
-    wrong = np.flatnonzero(~(gap >= 1.0))
+    wrong = np.flatnonzero(~(gap >= 1.0) | np.isnan(place[order] + run[order]))
     if wrong.size:
         lines = sorted(table.lines[row] for row in order[np.union1d(wrong, wrong - 1)])
         raise CalibError(

@@ -336,8 +336,10 @@ def chosen_tests(
         trace = [state.now()]
         if trace[0].get(aim, 0.0) < 1e-4:
             raise CalibError(
-                "there is nothing to settle: it is as good as certain", where=grid.source,
-                expected="a decision or causes in doubt", hint="plan for the bands",
+                f"the {'causes are' if aim == 'causes' else 'decision is'} as good as certain: the "
+                "probability of being wrong is below 0.01 %, and no test can lower it noticeably",
+                expected="a decision or causes in doubt",
+                hint="no test is needed for it; to narrow the prediction, plan for the bands",
             )  # fmt: skip
         while (left := np.flatnonzero(cost <= budget - cost[found].sum() + 1e-9)).size:
             gain = trace[-1][aim] - state.losses(left)

@@ -229,7 +229,8 @@ class Drawn:
             _, own = np.unique(x[rows], return_index=True)
             if own.size < 3:
                 raise CalibError(
-                    f"a peak along {over} is sought among {own.size} values of it", where="peak",
+                    f"{own.size} value{'s' * (own.size > 1)} of {over} cannot show a peak",
+                    where="peak",
                     expected="three or more of each setting of the other conditions",
                     hint="give rows along it",
                 )  # fmt: skip

@@ -78,7 +78,9 @@ def test_rows_of_a_group_held_out_are_those_of_a_new_one(calib: Calib) -> None:
     assert found["scores"]["rut_depth D"]["sentence"].startswith("rut_depth D, held out as a new")
     assert found["scores"]["rut_depth D"]["covered_90"] == 3
     assert_refused(calib(*FIT, "--hold-out", "bin=E"), ["there is no group E", "A, B, C, D"])
-    assert_refused(calib(*FIT, "--hold-out", "slip_percent=3"), ["no data have this column"])
+    assert_refused(
+        calib(*FIT, "--hold-out", "slip_percent=3"), ["none of the files has this column"]
+    )
 
 
 def test_each_model_may_have_its_own_file(calib: Calib) -> None:

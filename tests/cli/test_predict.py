@@ -115,15 +115,18 @@ def test_a_peak_is_sought_along_a_condition(calib: Calib, run: Path, at: str) ->
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--exceeds", "drawbar_pull_kn=1"], ["no drawbar_pull_kn here", "rut_depth_mm"]),
+        (["--exceeds", "drawbar_pull_kn=1"], ["no column drawbar_pull_kn here", "rut_depth_mm"]),
         (["--exceeds", "rut_depth_mm"], ["cannot read --exceeds", "COLUMN=VALUE"]),
         (["--below", "rut_depth=1"], ["does not say the unit"]),
         (["--below", "rut_depth_mm=nan"], ["is no comparison"]),
         (["--quantiles", "5%"], ["cannot read --quantiles"]),
         (["--quantiles", "5,95"], ["there is no quantile", "below 1"]),
         (["--draws", "3"], ["beside a file", "--out"]),
-        (["--peak-over", "speed_m_s"], ["no speed_m_s here"]),
-        (["--peak-over", "slip_percent", "--exceeds", "rut_depth_mm=1"], ["one after the other"]),
+        (["--peak-over", "speed_m_s"], ["no column speed_m_s here"]),
+        (
+            ["--peak-over", "slip_percent", "--exceeds", "rut_depth_mm=1"],
+            ["cannot be combined", "once for each"],
+        ),
         (["--priors", "p.toml"], ["not clear what to predict with"]),
         (["--model", "bekker"], ["not clear what to predict with"]),
     ],

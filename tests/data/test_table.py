@@ -171,3 +171,13 @@ def test_no_exponent_where_digits_are_read_faster(value: float, digits: int) -> 
     text = plain_number(value, digits)
     assert "e" not in text
     assert float(text) == pytest.approx(value, rel=0.51 * 10.0 ** (1 - digits))
+
+
+def test_rows_nearly_at_a_value_are_not_left_to_be_fitted() -> None:
+    """A gauge scatters: to hold out 206 of a test at about 206 is to fit its neighbours."""
+    pressure = [124.0, 124.1, 205.9, 206.0, 206.3, 289.0]
+    data = {"inflation_pressure_kpa": pressure, "drawbar_pull_kn": [1.0, 1.1, 0.8, 0.9, 0.7, 0.5]}
+    with pytest.raises(CalibError, match=r"such as 206\.3, would be fitted: 1, beside 2 held out"):
+        hold_out(table_from_arrays(data), "inflation_pressure_kpa", 206.0)
+    rest, held = hold_out(table_from_arrays(data), "inflation_pressure_kpa", 289.0)
+    assert (len(rest), len(held)) == (5, 1)

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import calib
+from calib.errors import CalibError
 from calib.imports import read_log, suggest_mapping
 from calib.imports.independence import autocorrelation_time, rows_apart
 from calib.imports.mapping import Mapped
@@ -167,3 +168,28 @@ def test_a_file_whose_rows_differ_in_length_is_refused() -> None:
         pytest.skip("no shared files here")
     with pytest.raises(calib.CalibError, match="line 5: the row has 4 cells"):
         suggest_mapping(SHARED / "replicates_wide.csv")
+
+
+def test_a_unit_that_the_file_contradicts_is_said(tmp_path: Path) -> None:
+    text = "FX;P\nN;kPa\n410;180\n930;181\n"
+    columns = {"drawbar_pull_n": {"from": "FX", "unit": "N"},
+               "inflation_pressure_psi": {"from": "P", "unit": "psi"}}  # fmt: skip
+    path = write(tmp_path / "rig.txt", text)
+    report = read_log(path, {"columns": columns}).report
+    assert report.warning == "P is read in psi, as the mapping says; the file says kPa"
+
+
+def test_kappa_is_no_column_of_the_other_slip(tmp_path: Path) -> None:
+    path = write(tmp_path / "rig.txt", "v;w;FX\n1.0;4.0;410\n0.9;4.0;930\n")
+    speeds = {"speed": {"from": "v", "unit": "m/s"}, "wheel_speed": {"from": "w", "unit": "rad/s"},
+              "radius": {"value": 0.3, "unit": "m"}}  # fmt: skip
+    for name in ("slip_ratio", "slip_percent"):
+        with pytest.raises(CalibError, match="kappa is the slip"):
+            read_log(path, {"columns": {name: {"derive": "kappa", "inputs": speeds}}})
+    columns = {
+        "slip_kappa_ratio": {"derive": "kappa", "inputs": speeds},
+        "drawbar_pull_n": {"from": "FX", "unit": "N"},
+    }
+    slip = read_log(path, {"columns": columns, "thin": {"every": 1}}).table
+    np.testing.assert_allclose(slip["slip_ratio"], [1 - 1.0 / 1.2, 1 - 0.9 / 1.2])
+    assert slip["run_order"].tolist() == [1.0, 2.0]

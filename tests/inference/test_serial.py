@@ -110,14 +110,14 @@ def test_it_is_kept_and_named_and_refused_where_it_is_not_known(tmp_path: Path) 
     readings = "".join(f"0.{i},1{i}0,2{i}\n" for i in range(1, 8))
     field.write_text(f"slip_ratio,average_ground_pressure_kpa,rut_depth_mm\n{readings}")
     case = case_from_run(tmp_path / "run", field)
-    with pytest.raises(CalibError, match="run_order, a column that is not there"):
+    with pytest.raises(CalibError, match="correlated along run_order, and the data have no"):
         campaigns(case)
 
 
 @pytest.mark.parametrize(
     ("columns", "message"),
     [
-        ({}, "run_order, a column that is not there"),
+        ({}, "correlated along run_order, and the data have no"),
         ({"run_order": np.array([1.0, 2.0, 2.0, 4.0, 5.0, 6.0, 7.0])}, "not say in which order"),
         ({"run_order": np.array([1.0, 1.5, 2.0, 4.0, 5.0, 6.0, 7.0])}, "not say in which order"),
     ],
@@ -144,3 +144,10 @@ def test_the_order_is_the_tables_not_the_problems() -> None:
     )
     with pytest.raises(CalibError, match="not say in which order"):
         serial_of("run_order", empty)
+    # Nor is it right where the row is the only one of its run.
+    order, run = np.append(np.arange(1.0, 7.0), np.nan), np.array([1.0] * 6 + [2.0])
+    alone = table_from_arrays(
+        {**table().columns, "run_order": order, "run": run}, allow_missing=["run_order"]
+    )
+    with pytest.raises(CalibError, match="not say in which order"):
+        serial_of("run_order", alone)
