@@ -74,7 +74,7 @@ def test_the_measurement_that_a_diagnosis_proposes_is_as_good_as_any(two: Correc
 
 def test_of_one_explanation_no_causes_are_separated(two: Corrected) -> None:
     alone = replace(two.mixture, fits=two.mixture.fits[:1], probability=(1.0,))
-    with pytest.raises(CalibError, match="nothing to settle"):
+    with pytest.raises(CalibError, match="causes are as good as certain"):
         plan_tests(Corrected(alone, two.lab_mode), GRID, 1, aim="causes")
     with pytest.raises(CalibError, match="needs inflation_pressure_psi"):
         plan_tests(two, {n: v for n, v in GRID.items() if n != "inflation_pressure_psi"}, 1)
