@@ -281,7 +281,12 @@ def predict(
         announce(line)
     _give(columns, out, *(p.table for p in problems.values()))
     numbers = {"columns": _numbers(columns)} | ({"everywhere": everywhere} if everywhere else {})
-    finish(0 if converged else 3, numbers, outside=outside, doubts=list(doubts))
+    finish(
+        0 if converged and undefined < len(table) else 3,
+        numbers,
+        outside=outside,
+        doubts=list(doubts),
+    )
 
 
 def _predict_joint(
@@ -391,7 +396,7 @@ def _predict_corrected(
         announce(line)
     _give(columns, out, corrected.data.case.lab, corrected.data.case.field)
     numbers = {"columns": _numbers(columns)} | ({"everywhere": everywhere} if everywhere else {})
-    finish(0, numbers, outside=outside)
+    finish(0 if nowhere < len(table) else 3, numbers, outside=outside)
 
 
 def _say_outside(table: Table, known: Mapping[str, Any], columns: Mapping[str, Any]) -> int:

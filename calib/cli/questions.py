@@ -44,6 +44,7 @@ PeakOver = Annotated[
         "over the range it has in the file, at each setting of the others."
     ),
 ]
+_OTHER_UNIT = 100.0  # times any reading: a bound that large is rather in another unit
 _POINTS = 101  # of a curve whose peak is sought, a parabola between them
 
 
@@ -115,11 +116,12 @@ class Asked:
             peaks, said = _peaks(self.over, found)
             columns = echoed(given, *OUTPUTS.values(), along) | peaks
             return columns | {"outside_calibrated_range": flags}, [], said
-        more, everywhere = dict[str, Any](), []
+        more, everywhere, doubts = dict[str, Any](), list[dict[str, Any]](), list[str]()
         for header, limit, sign in self.limits:
-            cells, whole = _chances(found, header, limit, sign)
+            cells, whole, doubt = _chances(found, header, limit, sign)
             more |= cells
             everywhere.append(whole)
+            doubts += doubt
         for name, one in found.items() if self.quantiles else ():
             for kind, values in one.quantile(self.quantiles)._asdict().items():
                 levels = zip(self.quantiles, values, strict=True)
@@ -128,7 +130,7 @@ class Asked:
             drawn = {name: one.draws(self.draws) for name, one in found.items()}
             write_table(draws_beside(out), long := _long(drawn))
             print(f"{long['draw'][-1]} draws of each row written to {draws_beside(out)}")
-        return before_last(columns, more), everywhere, [_in_words(e) for e in everywhere]
+        return before_last(columns, more), everywhere, doubts + [_in_words(e) for e in everywhere]
 
 
 def _in_words(whole: Mapping[str, Any]) -> str:
@@ -158,12 +160,16 @@ def _named(header: str, names: Sequence[str]) -> Column:
 
 def _chances(
     found: Found, header: str, limit: float, sign: str
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the columns of a probability, and what it is in all rows at once."""
+) -> tuple[dict[str, Any], dict[str, Any], list[str]]:
+    """Return the columns of a probability, what it is in all rows at once, and a doubt."""
+    import numpy as np
+
     from calib.data.table import normal
 
     column = _named(header, [*found])
-    p = found[column.quantity.canonical].probability(sign, float(column.to_canonical(limit)))
+    one, bound = found[column.quantity.canonical], float(column.to_canonical(limit))
+    p = one.probability(sign, bound)
+    largest = float(np.nanmax(np.abs(one.quantile([0.005, 0.995]).reading), initial=0.0))
     what = f"{'above' if sign == '>' else 'below'}_{limit:g}"
     columns, whole = dict[str, Any](), dict[str, Any](asked=f"{header} {sign} {limit:g}")
     for kind, row, every in (
@@ -172,7 +178,9 @@ def _chances(
         columns[f"{normal(header)}_{kind}_{what}"] = row.value
         columns[f"{normal(header)}_{kind}_{what}_error"] = row.error
         whole |= {kind: float(every.value), f"{kind}_error": float(every.error)}
-    return columns, whole
+    far = abs(bound) / largest if largest else 0.0
+    doubt = f"{header} = {limit:g} is {far:.3g} times as large as any reading predicted here: check"
+    return columns, whole, [f"{doubt} its unit"] if far >= _OTHER_UNIT else []
 
 
 def _peaks(over: str, found: Found) -> tuple[dict[str, Any], list[str]]:

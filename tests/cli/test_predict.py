@@ -156,6 +156,20 @@ def test_priors_predict_before_there_are_data(calib: Calib, at: str) -> None:
     assert_refused(calib(*pulls), ["inflation_pressure"])
 
 
+@pytest.mark.parametrize(
+    ("slip", "code", "said"), [(0.2, 0, "check its unit"), (-0.2, 3, "no value")]
+)
+def test_an_answer_that_says_nothing_is_not_given_in_silence(
+    calib: Calib, slip: float, code: int, said: str
+) -> None:
+    head = "slip_ratio,normal_load_kn,tyre_diameter_m,tyre_width_m\n"
+    Path("wheel.csv").write_text(f"{head}{slip},2,0.5,0.2\n", encoding="utf-8")
+    asked = ["predict", "--model", "wong_reece_pull", "--at", "wheel.csv"]
+    ran = calib(*asked, "--exceeds", "drawbar_pull_kn=1200")
+    assert (ran.code, said in ran.err) == (code, True)
+    assert "check its unit" not in calib(*asked, "--exceeds", "drawbar_pull_kn=1.2").err
+
+
 def test_an_answer_of_chains_that_did_not_converge_says_so(calib: Calib) -> None:
     Path("my.csv").write_text(example_csv("magic_formula_pressure"), encoding="utf-8")
     model = ["--model", "magic_formula_pressure", "--max-steps", 100]
