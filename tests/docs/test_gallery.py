@@ -89,6 +89,7 @@ def test_diagnosis(notebook: Notebook) -> None:
     assert notebook.figures == 2
 
 
+@pytest.mark.slow
 def test_own_simulator(notebook: Notebook) -> None:
     said("own_simulator", "inside the 95 % intervals", "at most 60 runs", "by more than a tenth")
     found, emulated = notebook["calibration"].summary, notebook["emulated"].summary
@@ -133,6 +134,7 @@ def test_next_measurement(notebook: Notebook) -> None:
     assert (notebook["verdict"].state, notebook.figures) == ("Cause named", 1)
 
 
+@pytest.mark.slow
 def test_review(notebook: Notebook) -> None:
     said("review", "the verdict is *with care*", "more than twice as much", "about two independent")
     assert "False" not in notebook.text

@@ -46,6 +46,7 @@ class Normal:
         return -0.5 * np.square(raw).sum(axis=1)
 
 
+@pytest.mark.slow
 def test_many_coordinates_do_not_bias_its_evidence(monkeypatch) -> None:
     """Particles that are moved by their own covariance draw together: 1.7 too much of 25."""
     normal = Normal()

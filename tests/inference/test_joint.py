@@ -110,10 +110,8 @@ def exact(data: pd.DataFrame) -> dict[str, tuple[float, float]]:
     return {**found, "tau_a": (of_tau, np.sqrt(weight @ grid**2 - of_tau**2))}
 
 
-@pytest.mark.parametrize(
-    "between",
-    [pytest.param(0.0, marks=pytest.mark.slow), 0.1, pytest.param(1.0, marks=pytest.mark.slow)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("between", [0.0, 0.1, 1.0])
 def test_groups_are_pooled_as_quadrature_says(between: float) -> None:
     data, _ = rows(between)
     found = calibrate_joint(build_joint({"known_line": data}, group="bin", pooled=["a"]), seed=1)

@@ -116,6 +116,7 @@ def test_a_table_is_judged_where_the_posterior_is(tmp_path: Path) -> None:
         calib.emulated(calib.build_problem("made", data), seed=1)
 
 
+@pytest.mark.slow
 def test_a_poor_emulator_says_what_it_is_good_for() -> None:
     declared(pull, "slow", emulate=True, runs=16, first=8, checks=3, tolerance=1e-3)
     emulation = calib.emulated(calib.build_problem("slow", table()), seed=1)
