@@ -6,6 +6,8 @@ textbooks, not from the measured cases.
 
 from __future__ import annotations
 
+from typing import Any, Literal
+
 import numpy as np
 
 from calib.data.quantities import Quantity, Range
@@ -16,7 +18,7 @@ from calib.models.base import Array, Conditions, Model
 _POSITIVE = Range(low=0.0)
 _WONG = "Wong (2008), Theory of Ground Vehicles"
 
-for _stem, _column, _unit, _role, _what, _more in (
+_QUANTITIES: tuple[tuple[str, str, str, Any, str, dict[str, Any]], ...] = (
     ("fall_distance", "fall_distance_m", "m", "output", "how far a body has fallen", {}),
     ("fall_time", "fall_time_s", "second", "condition", "time since a body was let fall",
      {"suffixes": {"s": "second"}}),
@@ -43,7 +45,8 @@ for _stem, _column, _unit, _role, _what, _more in (
     ("compaction_effort", "compaction_effort_kj_m3", "kJ/m**3", "condition",
      "work of the hammer over the volume of soil",
      {"suffixes": {"kj_m3": "kJ/m**3"}, "of_factors": True}),
-):  # fmt: skip
+)  # fmt: skip
+for _stem, _column, _unit, _role, _what, _more in _QUANTITIES:
     _kind = {"kPa": "pressure", "m": "length"}.get(_unit, _stem.replace("_", " "))
     register(Quantity(_stem, _column, _kind, _unit, _role, _what, **{"range": _POSITIVE, **_more}))
 
@@ -75,9 +78,9 @@ def _sinkage(theta: Array, conditions: Conditions) -> Array:
 
 
 def _model(
-    name: str, title: str, output: str, conditions: str, predict: object, latex: str,
+    name: str, title: str, output: str, conditions: str, predict: Any, latex: str,
     letters: str, source: str, example: str, priors: dict[str, tuple[float, float, str, str]],
-    response: str = "identity",
+    response: Literal["identity", "log"] = "identity",
 ) -> None:  # fmt: skip
     """Register a model; a prior is the median and sd of the logarithm, the unit and the reason."""
     text = f'model = "{name}"\n' + "".join(
@@ -89,8 +92,8 @@ def _model(
     rows = "\n".join(example.split())
     register(
         Model(
-            name, title, output, columns, tuple(priors)[:-1], predict, latex=(latex,),  # type: ignore[arg-type]
-            letters=letters, source=source, response=response,  # type: ignore[arg-type]
+            name, title, output, columns, tuple(priors)[:-1], predict, latex=(latex,),
+            letters=letters, source=source, response=response,
             example=f"{','.join((*columns, output))}\n{rows}\n", priors=text,
         )
     )  # fmt: skip
