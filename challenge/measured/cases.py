@@ -15,9 +15,11 @@ import numpy as np
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 
-__all__ = ["HERE", "NONE", "UNLISTED", "MeasuredCase", "read_cases"]
+__all__ = ["HERE", "NONE", "SIMULATORS", "UNLISTED", "MeasuredCase", "read_cases"]
 
 HERE = Path(__file__).parent
+# The bench's own simulators, as `--models` takes them.
+SIMULATORS = tuple(p for p in sorted(HERE.glob("*.py")) if "\nregister(" in p.read_text("utf-8"))
 NONE, UNLISTED = "none", "unlisted"
 _SERIES = "series"
 
