@@ -15,9 +15,10 @@ import numpy as np
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 
-__all__ = ["HERE", "NONE", "UNLISTED", "MeasuredCase", "read_cases"]
+__all__ = ["HERE", "NONE", "SIMULATORS", "UNLISTED", "MeasuredCase", "read_cases"]
 
 HERE = Path(__file__).parent
+SIMULATORS = ("traction.py", "tyre_on_belt.py")
 NONE, UNLISTED = "none", "unlisted"
 _SERIES = "series"
 

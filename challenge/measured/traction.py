@@ -78,4 +78,6 @@ MODEL = Model(
     priors=_PRIORS,
 )
 
-register(MODEL)
+MODELS = (MODEL,)
+
+register(*MODELS)
