@@ -9,12 +9,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from calib.errors import CalibError
-from challenge.measured.cases import HERE, SIMULATORS, read_cases
+from challenge.measured.cases import SIMULATORS, read_cases
 from challenge.measured.marks import mark, markdown
 
 # The bench knows what the program reads and writes, and imports none of the diagnosis.
 _PROGRAM = (sys.executable, "-c", "from calib.cli import main; main()")
-_SIMULATORS = [a for name in SIMULATORS for a in ("--models", str(HERE / name))]
 
 
 def run(out: Path, *, set_aside: bool = False, seed: int = 1, only: Sequence[str] = ()) -> str:
@@ -59,7 +58,8 @@ def run(out: Path, *, set_aside: bool = False, seed: int = 1, only: Sequence[str
     # A case that cannot be diagnosed is named by the program and marked as failed.
     subprocess.run(
         [*_PROGRAM, "challenge", "run", str(out / "cases"), "--out", str(results),
-         "--seed", str(seed), "--workers", "1", *_SIMULATORS], check=False,
+         "--seed", str(seed), "--workers", "1",
+         *(word for file in SIMULATORS for word in ("--models", str(file)))], check=False,
     )  # fmt: skip
     table = markdown([mark(case, results / case.name) for case in chosen])
     (out / "measured.md").write_text(table, encoding="utf-8")

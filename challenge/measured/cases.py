@@ -18,7 +18,8 @@ from calib.errors import CalibError
 __all__ = ["HERE", "NONE", "SIMULATORS", "UNLISTED", "MeasuredCase", "read_cases"]
 
 HERE = Path(__file__).parent
-SIMULATORS = ("traction.py", "tyre_on_belt.py")
+# The bench's own simulators, as `--models` takes them.
+SIMULATORS = tuple(p for p in sorted(HERE.glob("*.py")) if "\nregister(" in p.read_text("utf-8"))
 NONE, UNLISTED = "none", "unlisted"
 _SERIES = "series"
 

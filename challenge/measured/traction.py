@@ -78,6 +78,4 @@ MODEL = Model(
     priors=_PRIORS,
 )
 
-MODELS = (MODEL,)
-
-register(*MODELS)
+register(MODEL)

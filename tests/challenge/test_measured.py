@@ -11,16 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.batch.user_code import run_file
 from calib.data import read_table
 from calib.data.quantities import QUANTITIES
-from calib.data.registry import register
 from calib.errors import CalibError
 from calib.gap.constants import MIN_FIELD_ROWS
 from calib.gap.effects import EFFECTS
 from calib.inference.problem import build_problem
 from calib.models import MODELS
 from calib.models.magic_formula import magic_formula
+from calib.models.simulators.files import load_files
 from challenge.measured.__main__ import run
 from challenge.measured.cases import HERE, NONE, SIMULATORS, UNLISTED, MeasuredCase, read_cases
 from challenge.measured.marks import FAILED, mark, markdown
@@ -40,10 +39,8 @@ def named(name: str) -> MeasuredCase:
 @pytest.fixture(scope="module")
 def simulators() -> Iterator[None]:
     """Register the bench's own simulators, and take them back."""
-    with forgotten(MODELS, QUANTITIES):
-        for name in SIMULATORS:
-            module = run_file(HERE / name, "models")
-            register(*getattr(module, "QUANTITIES", ()), *module.MODELS)
+    with forgotten(QUANTITIES, MODELS, EFFECTS):
+        load_files(SIMULATORS)
         yield
 
 
