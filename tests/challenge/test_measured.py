@@ -21,6 +21,7 @@ from calib.gap.effects import EFFECTS
 from calib.gap.effects.base import View
 from calib.inference.problem import build_problem
 from calib.models import MODELS
+from calib.models.magic_formula import magic_formula
 from calib.models.simulators.files import load_files
 from challenge.measured.__main__ import run
 from challenge.measured.cases import HERE, NONE, SIMULATORS, UNLISTED, MeasuredCase, read_cases
@@ -63,6 +64,22 @@ def test_a_case_can_be_calibrated_and_predicted(
             predicted = problem.bound.mean_response(problem.of_model(drawn), conditions)
             # A soil may be too soft for the wheel; a row must not be beyond the model.
             assert np.isfinite(predicted).any(axis=0).all()
+
+
+def test_the_tyre_s_curve_is_the_magic_formula_over_the_load(simulators: None) -> None:
+    named_parameters = {
+        "mu": 1.4, "k": 0.3, "mu_falls": 0.2, "k_falls": 0.4, "C": 1.3, "G": 2.0, "G_falls": 0.5,
+        "G_sides": 0.25, "Sh": 0.1, "Sv": 0.02,
+    }  # fmt: skip
+    model = MODELS["belt_cornering"]
+    angle, load = np.array([-6.0, -1.0, 0.5, 4.0]), np.array([1.0, 2.0, 3.0, 2.0])
+    theta = np.array([[named_parameters[p] for p in model.parameters]])
+    predicted = model.predict(theta, {"steering_angle_deg": angle, "normal_load_kn": load})
+    for x, w, force in zip(angle, load, predicted[0], strict=True):
+        peak, slope = 1.4 * w * (w / 2) ** -0.2, 0.3 * w * (w / 2) ** -0.4
+        curvature = 1 - 2 * (w / 2) ** -0.5 * np.exp(0.25 if x > 0.1 else -0.25)
+        by_hand = magic_formula(x, slope / (1.3 * peak), 1.3, peak, curvature, 0.1, 0.02 * w)
+        assert force == pytest.approx(float(by_hand), rel=1e-9)
 
 
 def test_written_cases_hold_no_answer(tmp_path: Path) -> None:

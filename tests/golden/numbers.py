@@ -125,6 +125,15 @@ def _bench() -> Path:
     return folder
 
 
+def recorded() -> dict[str, dict[str, Any]]:
+    """Return what was computed before the redesign, by kind and name, then number."""
+    return json.loads(FILE.read_text(encoding="utf-8")) if FILE.exists() else {}
+
+
+def _recorded(case: str) -> bool:
+    return f"diagnosis/measured/{case}" in recorded()
+
+
 _FOLDERS: Mapping[str, Callable[[], Path]] = {
     "shared": lambda: SHARED, "measured": _measured, "bench": _bench,
 }  # fmt: skip
@@ -137,17 +146,13 @@ KINDS: Mapping[str, tuple[Callable[[str], Numbers], tuple[str, ...]]] = {
         diagnosis,
         (
             *(f"shared/{name}" for name in _SHARED),
-            *(f"measured/{case.name}" for case in read_cases()),
+            # Cases that came later have their own report.
+            *(f"measured/{case.name}" for case in read_cases() if _recorded(case.name)),
             *(f"bench/case-{i:03d}" for i in range(8)),
         ),
     ),
 }
 """By kind: how numbers are made, and of what."""
-
-
-def recorded() -> dict[str, dict[str, Any]]:
-    """Return what was computed before the redesign, by kind and name, then number."""
-    return json.loads(FILE.read_text(encoding="utf-8")) if FILE.exists() else {}
 
 
 def moved(before: Mapping[str, Any], now: Numbers) -> list[str]:
