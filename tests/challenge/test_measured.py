@@ -45,7 +45,7 @@ def traction() -> Iterator[None]:
 def test_a_case_can_be_calibrated_and_predicted(
     case: MeasuredCase, tmp_path: Path, traction: None
 ) -> None:
-    case.write(tmp_path / "case")
+    case.write(tmp_path / "case", tmp_path / "answers")
     lab, field = (read_table(tmp_path / "case" / f"{part}.csv") for part in ("lab", "field"))
     assert len(field) >= MIN_FIELD_ROWS
     for model in case.models.values():
@@ -59,7 +59,7 @@ def test_a_case_can_be_calibrated_and_predicted(
 
 
 def test_written_cases_hold_no_answer(tmp_path: Path) -> None:
-    named("hit_lugs").write(tmp_path / "case")
+    named("hit_lugs").write(tmp_path / "case", tmp_path / "answers")
     text = "".join(p.read_text(encoding="utf-8") for p in (tmp_path / "case").iterdir())
     assert "lug" not in text
     assert "rut_depth" not in text

@@ -121,7 +121,7 @@ def _measured() -> Path:
 @cache
 def _bench() -> Path:
     folder = Path(_SCRATCH.name) / "bench"
-    make(folder, Path(_SCRATCH.name) / "sealed" / "key.json", seed=_SEED, n_cases=8)
+    make(folder, Path(_SCRATCH.name) / "sealed", seed=_SEED, n_cases=8)
     return folder
 
 
