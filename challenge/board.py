@@ -22,7 +22,7 @@ _PANELS = (
     ("miscalibrated", "calibration error", False),
     ("seconds", "seconds a case", False),
 )
-_LEGEND = """\
+_NOTES = """\
 - Causes named: of the causes that act, those said to act with a probability of 0.5 or more.
 - Wrongly sure: cases in which a listed cause that does not act is said to act at 0.9 or more.
 - Silent on nulls: cases without a gap whose verdict is `none`.
@@ -183,15 +183,21 @@ def write_board(page: Path, section: str, scores: Mapping[str, Score]) -> None:
     picture = page.with_name(f"board_{section}.png")
     page.parent.mkdir(parents=True, exist_ok=True)
     board_figure(lines, said).savefig(picture, dpi=150)
-    begin, end = f"<!-- board {section} -->", f"<!-- end of {section} -->"
     shown = f"![{said}, every program's figures with 95 % intervals]({picture.name})"
-    text = "\n\n".join(
-        [begin, f"{said}.", markdown(lines, len(answers)).strip(), shown, _LEGEND.strip(), end]
-    )
     old = page.read_text(encoding="utf-8") if page.exists() else "# Scoreboard\n"
-    part = re.compile(f"{re.escape(begin)}.*?{re.escape(end)}", re.S)
-    new = part.sub(lambda _: text, old) if part.search(old) else f"{old.rstrip()}\n\n{text}\n"
-    page.write_text(new, encoding="utf-8")
+    parts = {
+        section: f"{said}.\n\n{markdown(lines, len(answers))}\n{shown}",
+        "notes": _NOTES.strip(),
+    }
+    for name, text in parts.items():
+        begin, end = f"<!-- board {name} -->", f"<!-- end of {name} -->"
+        new, there = f"{begin}\n\n{text}\n\n{end}", f"{re.escape(begin)}.*?{re.escape(end)}"
+        if not re.search(there, old, re.S):
+            notes = "<!-- board notes -->"
+            head, mark, rest = old.partition(notes)
+            old = f"{head.rstrip()}\n\n{begin}{end}\n\n{mark}{rest}".rstrip() + "\n"
+        old = re.sub(there, lambda _, new=new: new, old, flags=re.S)
+    page.write_text(old, encoding="utf-8")
 
 
 def named_folders(words: Iterable[str]) -> dict[str, Path]:

@@ -227,7 +227,8 @@ def over(stated: Array, statistic: Callable[[Array], float]) -> Average:
         return average([], np.mean)
     rng = np.random.default_rng(0)
     again = [statistic(stated[:, rng.integers(0, n, n)]) for _ in range(400)]
-    low, high = (float(q) for q in np.nanquantile(again, [0.025, 0.975]))
+    again = [value for value in again if value == value] or [float("nan")]
+    low, high = (float(q) for q in np.quantile(again, [0.025, 0.975]))
     return Average(statistic(stated), (low, high), n)
 
 
