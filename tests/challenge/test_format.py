@@ -146,8 +146,8 @@ def test_all_faults_of_a_case_are_told_at_once_with_their_places(case: Path) -> 
     said = "\n".join(map(str, faults(case)))
     for words in (
         "case.toml, colour: ", "case.toml, answer_sha256: ", "64 digits",
-        "field.csv, line 3, column", "field.csv, line 10: the row has", "fresh.csv: there is no such file",
-        "the answer lies in the case",
+        "field.csv, line 3, column", "field.csv, line 10: the row has",
+        "fresh.csv: there is no such file", "the answer lies in the case",
     ):  # fmt: skip
         assert words in said
     with pytest.raises(CalibError, match="cannot be read"):
@@ -168,8 +168,8 @@ def test_a_simulator_takes_part_by_what_it_predicts(case: Path) -> None:
     assert "there is no model 'our_own'" in str(fault)
 
 
-def test_the_command_checks_a_case_its_answer_and_a_diagnosis(calib: Calib, case: Path) -> None:
-    good = calib("validate", case, "--answer", ANSWERS / case.name / "answer.json")
+def test_the_command_checks_a_case_its_answer_and_a_diagnosis(run: Calib, case: Path) -> None:
+    good = run("validate", case, "--answer", ANSWERS / case.name / "answer.json")
     assert (good.code, good.out) == (0, f"{case}: no faults\n")
     answer = ANSWERS / CASES[1].name / "answer.json"
     Path("said").mkdir()
@@ -179,7 +179,7 @@ def test_the_command_checks_a_case_its_answer_and_a_diagnosis(calib: Calib, case
         "where": [{"output": "drawbar_pull", "row": -1, "probability": 0.5}],
     }
     Path("said/diagnosis.json").write_text(json.dumps(said))
-    bad = calib("validate", case, "--answer", answer, "--diagnosis", "said")
+    bad = run("validate", case, "--answer", answer, "--diagnosis", "said")
     assert bad.code == 1
     for words in (
         "its SHA-256 is",
@@ -191,12 +191,12 @@ def test_the_command_checks_a_case_its_answer_and_a_diagnosis(calib: Calib, case
     said = {"verdict": "none", "effects": [{"name": "none", "probability": 0.9}]}
     said["where"] = [{"output": "drawbar_pull", "row": 999, "probability": 0.5}]
     Path("said/diagnosis.json").write_text(json.dumps(said))
-    found = json.loads(calib("validate", case, "--diagnosis", "said", "--json").out)
+    found = json.loads(run("validate", case, "--diagnosis", "said", "--json").out)
     assert "sum to 0.9, not 1" in found["faults"][0]
     said["effects"] = [{"name": "none", "probability": 1.0}]
     Path("said/diagnosis.json").write_text(json.dumps(said))
     Path("said/fresh_prediction.csv").write_text("drawbar_pull_kn_after\n1\n")
-    found = json.loads(calib("validate", case, "--diagnosis", "said", "--json").out)
+    found = json.loads(run("validate", case, "--diagnosis", "said", "--json").out)
     told = "\n".join(found["faults"])
     assert "the case has no row 999 of drawbar_pull" in told
     assert "there is no column drawbar_pull_kn_before" in told
