@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from challenge.answers import CaseAnswer
 from challenge.mechanism import NONE, UNKNOWN
@@ -33,7 +34,7 @@ _NOTES = """\
   such are right, in ten bins. The Brier score is 0 at best and 2 at worst.
 - Seconds: median over cases, wall clock on one machine.
 - Failed cases count as wrong everywhere but in the calibration error. Intervals are of 95 %
-  (Jeffreys; bootstrap over cases).
+  (Jeffreys, or a bootstrap).
 """
 
 
@@ -157,6 +158,7 @@ def board_figure(lines: Mapping[str, Line], title: str) -> Figure:
         else:
             span = 1.04 * max(1.0, axes.get_xlim()[1])
             axes.set_xlim(-0.04 * span, span)
+            axes.xaxis.set_major_locator(MaxNLocator(4))
         axes.grid(axis="x", color=_GREY, alpha=0.3)
     panels[0].set_yticks(range(len(lines)), [*lines])
     panels[0].set_ylim(len(lines) - 0.5, -0.5)
@@ -179,7 +181,7 @@ def write_board(page: Path, section: str, scores: Mapping[str, Score]) -> None:
     lines = {name: line(score) for name, score in scores.items()}
     answers = next(iter(scores.values())).answers
     nulls = sum(a.truth == NONE for a in answers)
-    said = f"{len(answers)} cases of {section}: {len(answers) - nulls} with a gap, {nulls} without"
+    said = f"{section}: {len(answers)} cases, {len(answers) - nulls} with a gap, {nulls} without"
     picture = page.with_name(f"board_{section}.png")
     page.parent.mkdir(parents=True, exist_ok=True)
     board_figure(lines, said).savefig(picture, dpi=150)

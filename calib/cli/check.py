@@ -172,6 +172,10 @@ def validate(
         print(*wrong, f"{reference}: {len(wrong) or 'no'} faults", sep="\n")
         finish(1 if wrong else 0, {"folder": str(reference), "faults": wrong})
         return
+    if answer is not None or diagnosis is not None:
+        raise CalibError(
+            "--answer and --diagnosis are of a case", where=str(file), hint="leave FILE out"
+        )
     from calib import consistency, load_calibration
     from calib.data import read_for_model
     from calib.report.verdict import kept_verdict

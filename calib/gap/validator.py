@@ -54,7 +54,10 @@ def faults(folder: Path) -> list[CalibError]:
     except ValidationError as error:
         found += invalid(error, str(path))
     except (OSError, ValueError) as error:
-        raise CalibError(f"it cannot be read: {error}", where=str(path)) from None
+        raise CalibError(
+            f"it cannot be read: {error}", where=str(path),
+            hint="give a case folder, or a run folder and a CSV",
+        ) from None  # fmt: skip
     if (folder / "answer.json").exists():
         found.append(CalibError("the answer lies in the case that it answers", where=str(folder)))
     tables: dict[str, Table] = {}

@@ -9,8 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from calib.errors import CalibError
+from challenge.answers import read_answer
 from challenge.measured.cases import HERE, read_cases
-from challenge.measured.marks import mark, markdown
+from challenge.measured.marks import markdown
+from challenge.seal import open_answers
 
 # The bench knows what the program reads and writes, and imports none of the diagnosis.
 _PROGRAM = (sys.executable, "-c", "from calib.cli import main; main()")
@@ -74,7 +76,9 @@ def run(
         [*_PROGRAM, "challenge", "run", str(out / "cases"), "--out", str(results),
          "--seed", str(seed), "--workers", "1", "--models", str(HERE / "traction.py")], check=False,
     )  # fmt: skip
-    table = markdown([mark(case, results / case.name) for case in chosen])
+    answers = open_answers(out / "cases", out / "answers")
+    found = [read_answer(case.name, answers[case.name], results / case.name) for case in chosen]
+    table = markdown(found, chosen)
     (out / "measured.md").write_text(table, encoding="utf-8")
     return table
 
