@@ -11,9 +11,11 @@ from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from calib.batch.user_code import run_file
+from calib.data.documents import read_numbers
 from calib.errors import CalibError
 from calib.gap.validator import faults
 from calib.models import MODELS
@@ -55,6 +57,18 @@ def test_ten_examples_have_answers_and_no_faults() -> None:
         said, _ = read_document(answer, Answer)
         assert said.salt
         assert said.fresh_truth.keys() == said.noise_sd.keys()
+
+
+def test_simulations_of_the_examples_are_the_calibrated_simulators() -> None:
+    for folder in CASES:
+        answer, _ = read_document(ANSWERS / folder.name / "answer.json", Answer)
+        without = (answer.model_extra or {})["fresh_without"]
+        for path in folder.glob("simulated_*.csv"):
+            truth = np.array(without[path.stem.removeprefix("simulated_")])
+            names = [f"predict_{row}" for row in range(truth.size)]
+            mean = np.stack([*read_numbers(path, names, 20).values()]).mean(axis=1)
+            # Rows in another order, or another unit, would miss by more than the truth varies.
+            assert np.std(mean - truth) < 0.5 * np.std(truth), path
 
 
 @pytest.fixture
