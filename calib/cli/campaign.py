@@ -242,6 +242,9 @@ def score(
     page: Annotated[
         Path | None, typer.Option(help="Markdown page for a table and a figure of all programs.")
     ] = None,
+    section: Annotated[
+        str, typer.Option(help="Name of the cases on that page; by default the folder's.")
+    ] = "",
     overwrite: opt.Overwrite = False,
     json: opt.Json = False,
 ) -> None:
@@ -266,7 +269,7 @@ def score(
     found = next(iter(scores.values()))
     table = text_table(found)
     if page is not None:
-        write_board(page, folder.name, scores)
+        write_board(page, section or folder.resolve().name, scores)
         print(page)
     if out is not None:
         with fresh_folder(out, overwrite=overwrite) as scratch:
