@@ -1,7 +1,7 @@
 """Add to cases what their calibrated simulators predict, for programs that lack these models.
 
-`python benchmarks/simulations.py CASE …` calibrates each simulator of a case on its laboratory's rows
-and writes draws of the posterior with the noise-free predictions at every row of the case's tables.
+`python benchmarks/simulations.py CASE …` calibrates each simulator of a case on its laboratory's
+rows and writes draws of the posterior, with noise-free predictions at every row of its tables.
 """
 
 from __future__ import annotations

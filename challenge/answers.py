@@ -227,7 +227,8 @@ def auc(score: Array, positive: NDArray[np.bool_]) -> float | None:
 
 
 def _true_gap(answer: Answer, output: str) -> Array:
-    return np.array(answer.field_truth[output]) - np.array(answer.field_without[output])
+    truth, without = (np.array(v[output]) for v in (answer.field_truth, answer.field_without))
+    return np.asarray(truth - without, dtype=np.float64)
 
 
 def _localisation(answer: Answer, diagnosis: Scored | None) -> float | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -193,12 +192,12 @@ def write_board(page: Path, section: str, scores: Mapping[str, Score]) -> None:
     }
     for name, text in parts.items():
         begin, end = f"<!-- board {name} -->", f"<!-- end of {name} -->"
-        new, there = f"{begin}\n\n{text}\n\n{end}", f"{re.escape(begin)}.*?{re.escape(end)}"
-        if not re.search(there, old, re.S):
+        if begin not in old:
             notes = "<!-- board notes -->"
             head, mark, rest = old.partition(notes)
             old = f"{head.rstrip()}\n\n{begin}{end}\n\n{mark}{rest}".rstrip() + "\n"
-        old = re.sub(there, lambda _, new=new: new, old, flags=re.S)
+        head, _, rest = old.partition(begin)
+        old = f"{head}{begin}\n\n{text}\n\n{end}{rest.partition(end)[2]}"
     page.write_text(old, encoding="utf-8")
 
 

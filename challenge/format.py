@@ -141,12 +141,14 @@ def faults(case: Path, answer: Path | None, diagnosis: Path | None) -> list[Cali
         Folder with ``diagnosis.json`` and, if there are conditions to predict,
         ``fresh_prediction.csv``.
     """
-    said, rows = {}, {}
+    said: dict[str, Any] = {}
+    rows: dict[str, int] = {}
     found: list[CalibError] = []
     try:
         said = tomllib.loads((case / "case.toml").read_text(encoding="utf-8-sig"))
-        rows = {key: len(open_csv(case / said[key]).rows)
-                for key in ("field", "predict") if key in said}  # fmt: skip
+        for key in ("field", "predict"):
+            if key in said:
+                rows[key] = len(open_csv(case / said[key]).rows)
     except (CalibError, OSError, ValueError, TypeError):
         pass  # the case is checked by itself
     checks = []

@@ -163,12 +163,12 @@ def validate(
         from calib.batch.environment import from_the_bench
         from calib.gap.validator import faults
 
-        found = faults(reference)
+        all_faults = faults(reference)
         if answer is not None or diagnosis is not None:
             with from_the_bench("calib validate --answer, --diagnosis"):
                 from challenge.format import faults as of_others
-            found += of_others(reference, answer, diagnosis)
-        wrong = [*map(str, found)]
+            all_faults += of_others(reference, answer, diagnosis)
+        wrong = [*map(str, all_faults)]
         print(*wrong, f"{reference}: {len(wrong) or 'no'} faults", sep="\n")
         finish(1 if wrong else 0, {"folder": str(reference), "faults": wrong})
         return
