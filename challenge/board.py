@@ -14,13 +14,13 @@ from challenge.answers import CaseAnswer
 from challenge.mechanism import NONE, UNKNOWN
 from challenge.score import Average, Proportion, Score, average, calibration_error, over
 
-_BLUE, _GREY = "#0072B2", "#999999"
+_BLUE, _GREEN, _GREY = "#0072B2", "#009E73", "#999999"
 _PANELS = (
-    ("named", "causes named", True),
-    ("silent", "silent on nulls", True),
-    ("missed_by", "error on rows left out, sds", False),
-    ("miscalibrated", "calibration error", False),
-    ("seconds", "seconds a case", False),
+    ("named", "causes named", True, 0.75),
+    ("silent", "silent on nulls", True, 0.95),
+    ("missed_by", "error on rows left out, sds", False, None),
+    ("miscalibrated", "calibration error", False, 0.10),
+    ("seconds", "seconds a case", False, None),
 )
 _NOTES = """\
 - Causes named: of the causes that act, those said to act with a probability of 0.5 or more.
@@ -33,7 +33,7 @@ _NOTES = """\
   such are right, in ten bins. The Brier score is 0 at best and 2 at worst.
 - Seconds: median over cases, wall clock on one machine.
 - Failed cases count as wrong everywhere but in the calibration error. Intervals are of 95 %
-  (Jeffreys, or a bootstrap).
+  (Jeffreys, or a bootstrap). Dashed: the levels asked for of measured cases, 0.75, 0.95 and 0.10.
 """
 
 
@@ -142,7 +142,7 @@ def board_figure(lines: Mapping[str, Line], title: str) -> Figure:
     """
     figure = Figure(figsize=(12.0, 1.7 + 0.42 * len(lines)), layout="constrained")
     panels = figure.subplots(1, len(_PANELS), sharey=True, squeeze=False)[0]
-    for axes, (name, label, more_is_better) in zip(panels, _PANELS, strict=True):
+    for axes, (name, label, more_is_better, level) in zip(panels, _PANELS, strict=True):
         for i, one in enumerate(lines.values()):
             got: Proportion | Average = getattr(one, name)
             if got.n:
@@ -151,13 +151,15 @@ def board_figure(lines: Mapping[str, Line], title: str) -> Figure:
             else:
                 axes.annotate("no such case", (0.5, i), xycoords=("axes fraction", "data"),
                               ha="center", va="center", fontsize=8, color=_GREY)  # fmt: skip
+        if level is not None:
+            axes.axvline(level, linestyle="--", color=_GREEN)
         axes.set_title(f"{label}\n({'more' if more_is_better else 'less'} is better)", fontsize=9)
         if name == "seconds":
             axes.set_xscale("log")
         else:
             span = 1.04 * max(1.0, axes.get_xlim()[1])
             axes.set_xlim(-0.04 * span, span)
-            axes.xaxis.set_major_locator(MaxNLocator(4))
+            axes.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 5, 10]))
         axes.grid(axis="x", color=_GREY, alpha=0.3)
     panels[0].set_yticks(range(len(lines)), [*lines])
     panels[0].set_ylim(len(lines) - 0.5, -0.5)
