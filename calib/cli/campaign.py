@@ -11,6 +11,7 @@ import typer
 from calib.batch.environment import from_the_bench
 from calib.cli import options as opt
 from calib.cli.options import announce, finish, progress_bars
+from calib.errors import CalibError
 
 
 def _tell_failed(failed: Mapping[str, str]) -> None:
@@ -35,7 +36,7 @@ def campaign(
     simulator: opt.Simulators = None,
     json: opt.Json = False,
 ) -> None:
-    """Run many fits, diagnoses, challenge cases or SBC replicates; run again to resume."""
+    """Run many fits, diagnoses or SBC replicates; run again to resume."""
     from calib.batch.campaign import read_plan, run_campaign
     from calib.data.reader import SEEN
 
@@ -172,6 +173,8 @@ def run(
     cases = case_folders(folder)
     diagnosed = partial(diagnose_cases, cases, out, seed, scheduler=scheduler)
     if program:
+        if scheduler:
+            raise CalibError("--program runs on this machine alone", hint="leave --scheduler out")
         with from_the_bench("calib challenge run --program"):
             from challenge.programs import run_programs
         diagnosed = partial(run_programs, program, cases, out, limit=limit)
