@@ -59,7 +59,8 @@ def run_programs(
     CalibError
         If the command does not say where its files go, or another one has written to `out`.
     """
-    words = [str(Path(w).resolve()) if Path(w).exists() else w for w in shlex.split(command)]
+    # Links are not followed: a Python finds its packages by the one it was started with.
+    words = [str(Path(w).absolute()) if Path(w).exists() else w for w in shlex.split(command)]
     for mark in (CASE, OUT):
         if not any(mark in word for word in words):
             raise CalibError(

@@ -267,6 +267,10 @@ def test_a_program_that_fails_is_told_and_counts_as_wrong(tmp_path: Path) -> Non
         found = read_answer(CASES[0].name, answer, tmp_path / f"out-{name}" / CASES[0].name)
         assert found.verdict == "failed"
         assert why in found.problem
+    # A Python of an environment has its packages.
+    command = f"{sys.executable} -c 'import numpy' {{case}} {{out}}"
+    (why,) = run_programs(command, CASES[:1], tmp_path / "numpy", limit=60.0).values()
+    assert "diagnosis.json: it cannot be read" in why
     with pytest.raises(CalibError, match="of another program"):
         run_programs("other {case} {out}", CASES[:1], tmp_path / "out-exit", limit=1.0)
     with pytest.raises(CalibError, match=r"there is no \{out\}"):
