@@ -290,7 +290,7 @@ def made_or_shared(scratch: Path) -> list[Path]:
         from challenge.make import make
 
         shared = scratch / "cases"
-        make(shared, scratch / "key.json", seed=SEED, n_cases=CASES)
+        make(shared, scratch / "answers", seed=SEED, n_cases=CASES)
     return sorted(p.parent for p in shared.glob("*/case.toml"))[:CASES]
 
 

@@ -1,6 +1,6 @@
 """Whether a listed cause is found in a large gap that is not quite of its formula's shape.
 
-    python benchmarks/large_gaps.py --cases cases --key answers.key     # of `calib challenge make`
+    python benchmarks/large_gaps.py --cases cases --key answers     # of `calib challenge make`
 
 Designs are those of challenge cases in which no listed effect acts. On each, a listed effect of 12
 or 20 noise sds (rms) is drawn from its prior, and its trace multiplied by a smooth random factor
@@ -11,7 +11,6 @@ probability that the cause acts, whatever acts besides, and its share of the gap
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,6 +27,7 @@ from calib.gap.hypotheses import split_testable
 from calib.gap.noise import noise_conditions
 from calib.gap.ranking import Lab, calibrate_lab
 from calib.gap.well_specified import Draw, draw_from_hypothesis
+from challenge.seal import open_answers
 
 DEPARTURE = 0.15
 SIZES = (20.0, 12.0)
@@ -88,8 +88,8 @@ def main() -> None:
     parser.add_argument("--key", type=Path, required=True)
     parser.add_argument("--designs", type=int, default=24)
     chosen = parser.parse_args()
-    key = json.loads(chosen.key.read_text(encoding="utf-8"))["cases"]
-    names = [n for n in sorted(key) if key[n]["truth"] in ("none", "unknown")][: chosen.designs]
+    key = open_answers(chosen.cases, chosen.key)
+    names = [n for n in sorted(key) if key[n].truth in ("none", "unknown")][: chosen.designs]
     found = []
     for i, name in enumerate(names):
         rng = np.random.default_rng([77, i])

@@ -1,8 +1,8 @@
 """Diagnose mixed gaps with the priors that `calib challenge make --tier large` draws them by.
 
-    calib challenge well-specified large --key large.key --out believed --out-key believed.key
+    calib challenge well-specified large --key key --out believed --out-key answers
     python benchmarks/mixed_limit.py --cases believed --out results
-    calib challenge score believed --results results --key believed.key
+    calib challenge score believed --results results --key answers
 
 Where readings are drawn by the formulas and priors of the diagnosis itself, and it knows how often
 the bench mixes causes, its probabilities are close to those of Bayes' theorem: whoever believes the

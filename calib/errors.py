@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 import reprlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 # What reading somebody else's file may raise.
@@ -25,7 +25,14 @@ class CalibError(Exception):
         What would have been accepted there.
     hint : str, optional
         What to do about it.
+
+    Attributes
+    ----------
+    each : tuple of CalibError
+        The problems it stands for, where there are several.
     """
+
+    each: tuple[CalibError, ...] = ()
 
     def __init__(
         self,
@@ -59,6 +66,17 @@ class CalibError(Exception):
         return (_rebuild, (self.message, self.where, self.expected, self.hint))
 
 
+def several(faults: Sequence[CalibError]) -> CalibError:
+    """Return an error that stands for others, and shows the first of them."""
+    if len(faults) == 1:
+        return faults[0]
+    more = f"\n  and {len(faults) - 5} more" if len(faults) > 5 else ""
+    lines = "".join(f"\n  {str(fault).splitlines()[0]}" for fault in faults[:5])
+    error = CalibError(f"{len(faults)} problems{lines}{more}")
+    error.each = tuple(faults)
+    return error
+
+
 def meant(name: str, known: Iterable[str], otherwise: str = "correct the name") -> str:
     """Suggest known names that contain a name, or else the most similar one.
 
@@ -88,6 +106,8 @@ def in_words(error: Mapping[str, Any]) -> str:
         return f"{key} is empty"
     if kind == "string_pattern_mismatch":
         said = "Input should be a name: a letter, then letters, digits and _"
+        if "0-9a-f" in error["ctx"]["pattern"]:
+            said = "Input should be a SHA-256: 64 digits, 0 to 9 and a to f"
     should = said.removeprefix("Input should be ")
     if should == said:
         return f"{said.removeprefix('Value error, ')} (found {reprlib.repr(error['input'])})"

@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
-import csv
-import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from itertools import compress, product
+from itertools import combinations
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 from scipy.stats import rankdata
 
-from challenge.files import OUTPUT_COLUMNS
+from calib.batch.tasks import failed_tasks
+from calib.data.documents import read_numbers
+from calib.data.quantities import OUTPUTS
+from calib.errors import CalibError
+from challenge.format import (
+    Acting,
+    Answer,
+    Explanation,
+    Scored,
+    prediction_columns,
+    read_document,
+)
 from challenge.mechanism import NONE, SHIFT, UNKNOWN
 
 type Array = NDArray[np.float64]
@@ -53,6 +61,24 @@ class ShrinkAnswer:
 
 
 @dataclass(frozen=True)
+class Prediction:
+    """One output at the rows that were left out.
+
+    Attributes
+    ----------
+    output : str
+        Name of the output.
+    before, after : float
+        Rms misses of the simulator and of the corrected one, in sds of the true values there.
+        Without a prediction 1, what their mean would miss by, and NaN before.
+    """
+
+    output: str
+    before: float = float("nan")
+    after: float = 1.0
+
+
+@dataclass(frozen=True)
 class CauseAnswer:
     """One cause of one case.
 
@@ -63,9 +89,10 @@ class CauseAnswer:
     probability : float
         That it acts, as stated.
     contribution : float
-        To the true gap, in noise sds; 0 where it does not act.
+        To the true gap, in noise sds; 0 where it does not act, infinite where it acts by nobody
+        knows how much, NaN where nobody knows whether it acts.
     share : float
-        Its true part of the gap.
+        Its true part of the gap; NaN where nobody knows.
     interval : tuple of float
         The stated 90 % interval of that.
     """
@@ -79,7 +106,9 @@ class CauseAnswer:
     @property
     def acts(self) -> bool | None:
         """Whether it acts; None where what it does is too little to be asked for."""
-        return self.contribution > 0.0 if not 0.0 < self.contribution < ASKED_FOR else None
+        if np.isnan(self.contribution) or 0.0 < self.contribution < ASKED_FOR:
+            return None
+        return self.contribution > 0.0
 
     @property
     def covered(self) -> bool:
@@ -113,7 +142,11 @@ class CaseAnswer:
         what each does on this design, chooses the truth (linearised); None where nobody worked
         that out.
     causes : tuple of CauseAnswer
-        Every cause that was considered or acts; empty where the key or the diagnosis does not say.
+        Every cause that was considered or acts.
+    defensible : tuple of str
+        Causes that are no wrong answer either.
+    predictions : tuple of Prediction
+        Of every output that is known, and varies, at rows that were left out.
     """
 
     case: str
@@ -127,6 +160,8 @@ class CaseAnswer:
     problem: str = ""
     told_apart: float | None = None
     causes: tuple[CauseAnswer, ...] = ()
+    defensible: tuple[str, ...] = ()
+    predictions: tuple[Prediction, ...] = ()
 
     @property
     def called(self) -> str:
@@ -140,12 +175,11 @@ class CaseAnswer:
 
     @property
     def right(self) -> frozenset[str]:
-        """What counts as the truth: it may leave out causes that add too little to be asked for."""
-        causes = self.truth.split("+")
-        weak = {c.name for c in self.causes if c.contribution > 0.0 and c.acts is None}
-        kept = [[True, False] if name in weak else [True] for name in causes]
-        sets = ("+".join(compress(causes, chosen)) for chosen in product(*kept))
-        return frozenset(name for name in sets if name)
+        """What counts as the truth: without weak causes or with defensible ones, or only these."""
+        weak = {c.name for c in self.causes if 0.0 < c.contribution < ASKED_FOR}
+        causes = {*self.truth.split("+")} - {NONE}
+        names = _unions(causes - weak, (weak & causes) | {*self.defensible})
+        return (names | _unions(set(), self.defensible) | {self.truth}) - {""}
 
     @property
     def truth_probability(self) -> float:
@@ -167,6 +201,12 @@ class CaseAnswer:
         return any(p >= at for name, p in self.ranked if name not in self.right)
 
 
+def _unions(whole: Collection[str], parts: Collection[str]) -> frozenset[str]:
+    """Return the names of sets that have all of some causes, and any of others."""
+    chosen = (combinations(parts, n) for n in range(len(parts) + 1))
+    return frozenset("+".join(sorted({*whole, *some})) for each in chosen for some in each)
+
+
 def auc(score: Array, positive: NDArray[np.bool_]) -> float | None:
     """Return the area under the ROC curve by ranks, ties shared; None with one class only.
 
@@ -186,62 +226,54 @@ def auc(score: Array, positive: NDArray[np.bool_]) -> float | None:
     return float(excess / (n_positive * n_negative))
 
 
-def _true_gap(entry: dict[str, Any], output: str) -> Array:
-    truth, without = (np.array(entry[name][output]) for name in ("field_truth", "field_without"))
+def _true_gap(answer: Answer, output: str) -> Array:
+    truth, without = (np.array(v[output]) for v in (answer.field_truth, answer.field_without))
     return np.asarray(truth - without, dtype=np.float64)
 
 
-def _localisation(entry: dict[str, Any], diagnosis: dict[str, Any]) -> float | None:
+def _localisation(answer: Answer, diagnosis: Scored | None) -> float | None:
     """Return the AUC over all rows and outputs; rows that were left out count as probability 0."""
-    said = {
-        (str(item["output"]), int(item["row"])): float(item["probability"])
-        for item in diagnosis.get("where", [])
-    }
-    scores, positives = [], []
-    for output, sd in entry["noise_sd"].items():
-        beyond = np.abs(_true_gap(entry, output)) > np.array(sd)
+    where = diagnosis.where if diagnosis else ()
+    said = {(item.output, item.row): item.probability for item in where}
+    scores, positives = [np.zeros(0)], [np.zeros(0, dtype=np.bool_)]
+    for output, sd in answer.noise_sd.items():
+        beyond = np.abs(_true_gap(answer, output)) > np.array(sd)
         positives.append(beyond)
         scores.append(np.array([said.get((output, row), 0.0) for row in range(beyond.size)]))
     return auc(np.concatenate(scores), np.concatenate(positives))
 
 
-def _predictions(path: Path) -> dict[str, Array]:
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    wanted = [f"{c}_{when}" for c in OUTPUT_COLUMNS.values() for when in ("before", "after")]
-    return {
-        name: np.array([float(row[name]) for row in rows])
-        for name in wanted
-        if rows and name in rows[0]
-    }
+def _misses(answer: Answer, output: str, predicted: Mapping[str, Array]) -> tuple[float, float]:
+    """Return the rms misses before and after at the rows that were left out; NaN without."""
+    truth, column = np.array(answer.fresh_truth[output]), OUTPUTS[output]
+    pair = (predicted.get(f"{column}_{when}") for when in ("before", "after"))
+    before, after = (
+        float("nan") if p is None else float(np.sqrt(np.mean((p - truth) ** 2))) for p in pair
+    )
+    return before, after
 
 
-def _actual_shrink(predictions: dict[str, Array], output: str, truth: Array) -> float:
-    column = OUTPUT_COLUMNS[output]
-    before, after = (predictions.get(f"{column}_{when}") for when in ("before", "after"))
-    if before is None or after is None or not before.size == after.size == truth.size:
-        return 0.0
-    miss_before, miss_after = (float(np.sqrt(np.mean((p - truth) ** 2))) for p in (before, after))
-    if not np.isfinite(miss_after) or miss_before <= 0.0:
-        return 0.0
-    return 1.0 - miss_after / miss_before
-
-
-def _interval(diagnosis: dict[str, Any], output: str) -> tuple[float, float] | None:
-    stated = diagnosis.get("shrink", {}).get(output, {}).get("interval")
-    return None if stated is None else (float(stated[0]), float(stated[1]))
+def _prediction(answer: Answer, output: str, predicted: Mapping[str, Array]) -> Prediction:
+    before, after = _misses(answer, output, predicted)
+    sd = float(np.std(answer.fresh_truth[output]))
+    return Prediction(output) if np.isnan(after) else Prediction(output, before / sd, after / sd)
 
 
 def _shrinks(
-    entry: dict[str, Any], diagnosis: dict[str, Any], predictions: dict[str, Array]
+    answer: Answer, diagnosis: Scored | None, predicted: Mapping[str, Array]
 ) -> tuple[ShrinkAnswer, ...]:
     answers = []
-    for output, sd in entry["noise_sd"].items():
-        gap = _true_gap(entry, output) / np.array(sd)
-        if np.sqrt(np.mean(gap**2)) < GAP_ON_OUTPUT:
+    for output, sd in answer.noise_sd.items():
+        gap = _true_gap(answer, output) / np.array(sd)
+        if output not in answer.fresh_truth or np.sqrt(np.mean(gap**2)) < GAP_ON_OUTPUT:
             continue
-        actual = _actual_shrink(predictions, output, np.array(entry["fresh_truth"][output]))
-        answers.append(ShrinkAnswer(output, actual, _interval(diagnosis, output)))
+        before, after = _misses(answer, output, predicted)
+        said = diagnosis.shrink.get(output) if diagnosis else None
+        interval = said.interval if said else None
+        actual = 1.0 - after / before if before > 0.0 else 0.0
+        answers.append(
+            ShrinkAnswer(output, actual, None if interval is None else (interval[0], interval[1]))
+        )
     return tuple(answers)
 
 
@@ -251,79 +283,89 @@ def _listed(name: str) -> str:
     return "+".join(causes) or UNKNOWN
 
 
-def _ranked(diagnosis: dict[str, Any]) -> tuple[tuple[str, float], ...]:
-    said = [(_listed(str(e["name"])), float(e["probability"])) for e in diagnosis["effects"]]
-    if not said or not all(np.isfinite(p) and 0.0 <= p <= 1.0 + 1e-9 for _, p in said):
-        raise ValueError("probabilities are missing or outside [0, 1]")
+def _ranked(effects: list[Explanation]) -> tuple[tuple[str, float], ...]:
     total: dict[str, float] = {}
-    for name, p in said:
-        total[name] = min(total.get(name, 0.0) + p, 1.0)
+    for e in effects:
+        name = _listed(e.name)
+        total[name] = min(total.get(name, 0.0) + e.probability, 1.0)
     return tuple(sorted(total.items(), key=lambda item: -item[1]))
 
 
-def read_answer(name: str, entry: dict[str, Any], folder: Path) -> CaseAnswer:
+def read_answer(name: str, answer: Answer, folder: Path) -> CaseAnswer:
     """Return one case's answer; what cannot be read is a failure, never a gap in the count.
 
     Parameters
     ----------
     name : str
         The case.
-    entry : dict
-        Its entry in the key.
+    answer : Answer
+        What is true of it.
     folder : Path
         Where its diagnosis was written.
     """
-    outputs = tuple(entry["noise_sd"])
+    path, diagnosis, predicted, problem = folder / "fresh_prediction.csv", None, {}, ""
     try:
-        diagnosis = json.loads((folder / "diagnosis.json").read_bytes())
-        ranked, verdict = _ranked(diagnosis), str(diagnosis["verdict"])
-        located = _localisation(entry, diagnosis)
-        path = folder / "fresh_prediction.csv"
-        predictions = _predictions(path) if path.exists() else {}
-        shrinks = _shrinks(entry, diagnosis, predictions)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError) as problem:
-        verdict, ranked, diagnosis = FAILED, (), {}
+        diagnosis, _ = read_document(folder / "diagnosis.json", Scored)
+        if path.exists() and answer.fresh_truth:
+            columns = prediction_columns(answer.fresh_truth)
+            rows = len(next(iter(answer.fresh_truth.values())))
+            predicted = read_numbers(path, columns, rows, missing_ok=True)
+    except CalibError as error:
+        diagnosis, problem = None, str(error)
+        if not (folder / "diagnosis.json").exists():
+            why = failed_tasks(folder.parent).get(name)
+            problem = why or "not diagnosed; go on with `calib challenge run`"
+    located = _localisation(answer, diagnosis)
+    if diagnosis is None and located is not None:
         # A failed case locates nothing: no better than chance, on cases where there is a gap.
-        located = None if _localisation(entry, {}) is None else 0.5
-        shrinks = _shrinks(entry, {}, {})
-        text = f"{type(problem).__name__}: {problem}"
-        if isinstance(problem, FileNotFoundError):
-            text = "not diagnosed; go on with `calib challenge run`"
-        return CaseAnswer(
-            name, entry["tier"], entry["truth"], verdict, ranked, located, shrinks, outputs, text,
-            _told_apart(entry),
-        )  # fmt: skip
-    located = None if entry["truth"] == NONE else located
+        located = 0.5
     return CaseAnswer(
-        name, entry["tier"], entry["truth"], verdict, ranked, located, shrinks, outputs,
-        told_apart=_told_apart(entry), causes=_causes(entry, diagnosis),
+        name, answer.tier, _listed(answer.truth), diagnosis.verdict if diagnosis else FAILED,
+        _ranked(diagnosis.effects) if diagnosis else (), None if answer.truth == NONE else located,
+        _shrinks(answer, diagnosis, predicted), tuple(answer.noise_sd or answer.fresh_truth),
+        problem, _told_apart(answer), _causes(answer, diagnosis) if diagnosis else (),
+        tuple(answer.defensible),
+        tuple(_prediction(answer, output, predicted)
+              for output, true in answer.fresh_truth.items() if np.ptp(true) > 0.0),
     )  # fmt: skip
 
 
-def _causes(entry: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> tuple[CauseAnswer, ...]:
+def _said(diagnosis: Scored) -> dict[str, Acting]:
+    """Return the probability of every cause to act: stated, or summed over explanations."""
+    total: dict[str, float] = {}
+    for e in diagnosis.effects:
+        for name in {*e.name.split("+")} - {NONE}:
+            total[name] = min(total.get(name, 0.0) + e.probability, 1.0)
+    summed = {name: Acting(probability=p) for name, p in total.items()}
+    if not diagnosis.inclusion:
+        return summed
+    rest = diagnosis.remainder or summed.get(UNKNOWN, Acting(probability=0.0))
+    return {**diagnosis.inclusion, UNKNOWN: rest}
+
+
+def _causes(answer: Answer, diagnosis: Scored) -> tuple[CauseAnswer, ...]:
     """Hold inclusion probabilities and shares against what truly acts."""
-    if "contributions" not in entry or "inclusion" not in diagnosis:
-        return ()
-    true = dict(entry["contributions"])
-    if entry["truth"] in (UNKNOWN, SHIFT):
-        true = {entry["truth"]: float(entry["gap_over_noise"])}
-    said = {**diagnosis["inclusion"], UNKNOWN: diagnosis["remainder"]}
-    total = sum(true.values())
-    return tuple(
-        CauseAnswer(
-            name,
-            float(said.get(name, {}).get("probability", 0.0)),
-            true.get(name, 0.0),
-            true.get(name, 0.0) / total if total else 0.0,
-            tuple(said.get(name, {}).get("share_interval", (0.0, 0.0))),
-        )
-        for name in dict.fromkeys([*said, *true])
-    )
+    told = "contributions" in answer.model_fields_set
+    names = [] if answer.truth == NONE else answer.truth.split("+")
+    true = answer.contributions if told else dict.fromkeys(names, float("inf"))
+    if answer.truth in (UNKNOWN, SHIFT):
+        true = {answer.truth: (answer.model_extra or {}).get("gap_over_noise", float("inf"))}
+    true = dict.fromkeys(answer.defensible, float("nan")) | true
+    said, total = _said(diagnosis), sum(true.values())
+    nothing = Acting(probability=0.0)
+    found = []
+    for name in dict.fromkeys([*said, *true]):
+        one, size = said.get(name, nothing), true.get(name, 0.0)
+        low, high = one.share_interval or (0.0, 0.0)
+        share = size / total if np.isfinite(total) and total else 0.0 * total
+        found.append(CauseAnswer(name, one.probability, size, share, (low, high)))
+    return tuple(found)
 
 
-def _told_apart(entry: Mapping[str, Any]) -> float | None:
+def _told_apart(answer: Answer) -> float | None:
     """Two laws whose means lie d noise sds apart are told apart with probability Phi(d / 2)."""
-    if entry["truth"] in (NONE, entry.get("rival")) or "rival_nats" not in entry:
+    more = answer.model_extra or {}
+    if answer.truth in (NONE, more.get("rival")) or "rival_nats" not in more:
         return None
-    nats = entry["rival_nats"]  # half the square of d; none without a rival
+    nats = more["rival_nats"]  # half the square of d; none without a rival
     return 1.0 if nats is None else float(ndtr(np.sqrt(0.5 * nats)))

@@ -1,9 +1,8 @@
-"""A case as files: the tables and the case file of the contract, and its entry in the key."""
+"""A case as files: the tables and the case file of the contract, and its answer."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -44,18 +43,12 @@ class CaseFiles:
     ----------
     files : dict
         File name to text.
-    key : dict
-        The case's entry in the key.
+    answer : dict
+        What is true of it, as ``answer.json`` has it.
     """
 
     files: dict[str, str]
-    key: dict[str, Any]
-
-    def write(self, folder: Path) -> None:
-        """Write the case folder."""
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, text in self.files.items():
-            (folder / name).write_text(text, encoding="utf-8")
+    answer: dict[str, Any]
 
 
 def _condition_columns(design: Design, conditions: Conditions) -> dict[str, list[str]]:
@@ -124,7 +117,8 @@ def case_files(rng: np.random.Generator, case: DrawnCase) -> CaseFiles:
     conditions = _condition_columns(design, scenario.field)
     field = conditions | _readings(rng, design.noise, case.field_truth, scenario.field_sd)
     told = case.told
-    key = {
+    answer = {
+        "salt": rng.bytes(16).hex(),
         "tier": design.tier,
         "truth": case.truth,
         "mechanism": case.mechanism,
@@ -147,4 +141,4 @@ def case_files(rng: np.random.Generator, case: DrawnCase) -> CaseFiles:
         "field.csv": _table(field),
         "fresh.csv": _table(_condition_columns(design, scenario.test)),
     }
-    return CaseFiles(files, key)
+    return CaseFiles(files, answer)

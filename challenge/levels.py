@@ -34,8 +34,9 @@ class Level:
     large: tuple[float, float] = (float("nan"), float("nan"))
 
     def limits(self, tier: str) -> tuple[float, float]:
-        """Return the limits in a tier."""
-        return {"easy": self.easy, "hard": self.hard, "large": self.large}[tier]
+        """Return the limits in a tier; NaN where nothing is asked for."""
+        known = {"easy": self.easy, "hard": self.hard, "large": self.large}
+        return known.get(tier, (float("nan"), float("nan")))
 
     def met(self, tier: str, value: float) -> bool:
         """Whether a value reaches the level; a missing value (NaN) does not."""

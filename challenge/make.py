@@ -1,15 +1,13 @@
-"""Make a blind test: cases with withheld answers, a sealed key, and the key's hash."""
+"""Make a blind test: cases, their withheld answers, and the hash of each in its case."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from calib.batch.folders import writing
 from calib.batch.tasks import completed
 from calib.errors import CalibError
 from challenge.build import try_case, unlisted_order
@@ -17,7 +15,7 @@ from challenge.design import TIERS, Tier
 from challenge.effects import LISTED, wheel_effects
 from challenge.files import CaseFiles, case_files
 from challenge.mechanism import NONE, SHIFT, UNKNOWN
-from challenge.seal import KEY_SCHEMA, check_new, new_folder, publish, seal
+from challenge.seal import check_new, new_folder, write_case
 
 type Progress = Callable[[int, int], None]
 type Job = tuple[np.random.SeedSequence, Tier, str]
@@ -118,8 +116,8 @@ def make_case(seed: np.random.SeedSequence, tier: Tier, truth: str) -> CaseFiles
 
 def case_jobs(
     seed: int, n_cases: int, tiers: tuple[Tier, ...], null_fraction: float = NULL_FRACTION
-) -> tuple[dict[str, Job], np.random.SeedSequence]:
-    """Return what each case of a blind test is made from, by name, and the seed of the plan.
+) -> dict[str, Job]:
+    """Return what each case of a blind test is made from, by name.
 
     Parameters
     ----------
@@ -140,7 +138,7 @@ def case_jobs(
     planning, *own = np.random.SeedSequence(seed).spawn(n_cases + 1)
     planned = plan(np.random.default_rng(planning), n_cases, tiers, null_fraction)
     jobs = zip(own, planned, strict=True)
-    return {f"case-{i:03d}": (s, *job) for i, (s, job) in enumerate(jobs)}, planning
+    return {f"case-{i:03d}": (s, *job) for i, (s, job) in enumerate(jobs)}
 
 
 def make_job(job: Job) -> CaseFiles:
@@ -150,7 +148,7 @@ def make_job(job: Job) -> CaseFiles:
 
 def make(
     out_dir: Path,
-    key_path: Path,
+    answers_dir: Path,
     *,
     seed: int,
     n_cases: int,
@@ -159,17 +157,17 @@ def make(
     workers: int = 1,
     scheduler: str | None = None,
     progress: Progress | None = None,
-) -> str:
-    """Write a blind test and return the hash of its key.
+) -> None:
+    """Write a blind test.
 
     Parameters
     ----------
     out_dir : Path
-        Folder for ``case-000/`` and so on, ``manifest.json`` and ``HASH``; new or empty.
-    key_path : Path
-        Where the sealed key goes, outside `out_dir`.
+        Folder for ``case-000/`` and so on; new or empty.
+    answers_dir : Path
+        Folder for ``case-000/answer.json`` and so on, outside `out_dir`; new or empty.
     seed : int
-        Seed of everything; kept in the key only, since it gives the answers away.
+        Seed of everything; kept in the answers only, since it gives them away.
     n_cases : int
         Number of cases.
     tiers : tuple of str
@@ -181,19 +179,14 @@ def make(
     progress : callable, optional
         Called with the number of cases done and their total.
 
-    Returns
-    -------
-    str
-        SHA-256 of the key.
-
     Raises
     ------
     CalibError
         If a path or a number will not do.
     """
-    check_new(out_dir, key_path)
-    jobs, planning = case_jobs(seed, n_cases, tiers, null_fraction)
-    entries: dict[str, Any] = {}
+    check_new(out_dir, answers_dir)
+    jobs = case_jobs(seed, n_cases, tiers, null_fraction)
+    done = 0
     with (
         new_folder(out_dir),
         closing(completed(make_job, jobs, workers=workers, scheduler=scheduler)) as coming,
@@ -201,14 +194,8 @@ def make(
         for task in coming:
             if task.result is None:
                 raise CalibError(f"{task.name} could not be made: {task.error}")
-            with writing(out_dir):
-                task.result.write(out_dir / task.name)
-            entries[task.name] = task.result.key
+            answer = task.result.answer | {"seed": seed}
+            write_case(out_dir / task.name, task.result.files, answers_dir, answer)
+            done += 1
             if progress is not None:
-                progress(len(entries), n_cases)
-    keys = {name: entries[name] for name in jobs}
-    salt = "".join(f"{word:08x}" for word in planning.generate_state(8)[4:])
-    key = {"schema": KEY_SCHEMA, "seed": seed, "salt": salt, "cases": keys}
-    digest = seal(key, key_path)
-    publish(out_dir, key, digest, tiers)
-    return digest
+                progress(done, n_cases)

@@ -1,4 +1,4 @@
-"""Other readings for the cases of a blind test: the same designs and truths, a key of their own."""
+"""Other readings for the cases of a blind test: the same designs and truths, their own answers."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from calib.batch.folders import writing
 from calib.batch.tasks import completed
 from calib.errors import CalibError
 from challenge.files import CaseFiles
-from challenge.seal import KEY_SCHEMA, check_new, new_folder, open_key, publish, seal
+from challenge.seal import check_new, new_folder, open_answers, sha256, write_case
 
 type Draw = Callable[[Path, str, float], tuple[dict[str, str], dict[str, Any]]]
 
@@ -23,14 +22,14 @@ class _Job:
     folder: Path
     tier: str
     truth: str
-    gap_over_noise: float
+    gap_over_noise: float | None
 
 
 def redraw(
     cases: Path,
-    key_path: Path,
+    answers_dir: Path,
     out: Path,
-    out_key: Path,
+    out_answers: Path,
     draw: Draw,
     *,
     seed: int,
@@ -43,15 +42,15 @@ def redraw(
 
     Parameters
     ----------
-    cases, key_path : Path
+    cases, answers_dir : Path
         The other one, as `challenge.make.make` wrote it.
-    out, out_key : Path
-        New: the cases, and their sealed answers, outside them.
+    out, out_answers : Path
+        New: the cases, and their answers, outside them.
     draw : callable
-        Returns files and key entry from a case's folder, truth and size of gap in noise sds, or
+        Returns files and answer from a case's folder, truth and size of gap in noise sds, or
         raises CalibError where it cannot. It can be pickled.
     seed : int
-        Of `draw`; kept in the key.
+        Of `draw`; kept in the answers.
     workers, scheduler, announce
         As for `calib.batch.tasks.completed`; the result does not depend on them.
     progress : callable, optional
@@ -65,16 +64,15 @@ def redraw(
     Raises
     ------
     CalibError
-        If the key is not that of the cases, a path will not do, or no case could be drawn.
+        If the answers are not those of the cases, a path will not do, or no case could be drawn.
     """
-    key = open_key(cases, key_path)
-    check_new(out, out_key)
+    answers = open_answers(cases, answers_dir)
+    check_new(out, out_answers)
     jobs = {
-        name: _Job(cases / name, entry["tier"], entry["truth"], entry["gap_over_noise"])
-        for name, entry in key["cases"].items()
+        name: _Job(cases / name, a.tier, a.truth, (a.model_extra or {}).get("gap_over_noise"))
+        for name, a in answers.items()
     }
-    entries: dict[str, Any] = {}
-    without: dict[str, str] = {}
+    done, without = 0, dict[str, str]()
     work = partial(_redrawn, draw)
     with (
         new_folder(out),
@@ -86,22 +84,21 @@ def redraw(
             if task.result is None:
                 without[task.name] = str(task.error)
             else:
-                with writing(out):
-                    task.result.write(out / task.name)
-                entries[task.name] = task.result.key
+                salt = sha256(f"{answers[task.name].salt}:{seed}".encode())[:32]
+                answer = task.result.answer | {"salt": salt, "seed": seed}
+                write_case(out / task.name, task.result.files, out_answers, answer)
+            done += 1
             if progress is not None:
-                progress(len(entries) + len(without), len(jobs))
-    if not entries:
+                progress(done, len(jobs))
+    if len(without) == len(jobs):
         raise CalibError(
             f"no case could be drawn: {next(iter(without.values()))}", where=str(cases)
         )
-    kept = {name: entries[name] for name in jobs if name in entries}
-    new = {"schema": KEY_SCHEMA, "seed": seed, "salt": key["salt"], "cases": kept}
-    tiers = tuple(dict.fromkeys(entry["tier"] for entry in kept.values()))
-    publish(out, new, seal(new, out_key), tiers)
     return {name: without[name] for name in jobs if name in without}
 
 
 def _redrawn(draw: Draw, job: _Job) -> CaseFiles:
-    files, key = draw(job.folder, job.truth, job.gap_over_noise)
-    return CaseFiles(files, {"tier": job.tier, "truth": job.truth, **key})
+    if job.gap_over_noise is None:
+        raise CalibError("its answer does not say gap_over_noise")
+    files, answer = draw(job.folder, job.truth, job.gap_over_noise)
+    return CaseFiles(files, {"tier": job.tier, "truth": job.truth, **answer})

@@ -11,6 +11,7 @@ from typing import Any
 from calib.errors import CalibError
 from challenge.seal import sha256
 
+INPUTS = "inputs.json"
 _TABLES = ("calibration", "field", "predict")
 _SHOWN = 5
 
@@ -39,10 +40,10 @@ def check_results(cases_dir: Path, results_dir: Path, names: Sequence[str]) -> t
         )  # fmt: skip
     foreign, untold = [], []
     for name in there:
-        said = _recorded(results_dir / name / "inputs.json")
+        said = _recorded(results_dir / name / INPUTS)
         if said is None or not (cases_dir / name / "case.toml").is_file():
             untold.append(name)
-        elif any(said.get(key) != value for key, value in _found(cases_dir / name).items()):
+        elif any(said.get(key) != value for key, value in found_in(cases_dir / name).items()):
             foreign.append(name)
     if foreign:
         raise CalibError(
@@ -68,7 +69,7 @@ def _recorded(path: Path) -> dict[str, Any] | None:
     return found if isinstance(found, dict) else None
 
 
-def _found(folder: Path) -> dict[str, Any]:
+def found_in(folder: Path) -> dict[str, Any]:
     """Return models and hashes of a case folder, as ``inputs.json`` has them."""
     try:
         content = tomllib.loads((folder / "case.toml").read_text(encoding="utf-8-sig"))

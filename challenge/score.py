@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import beta
 
+from calib.batch.tasks import read_seconds
 from calib.errors import CalibError
 from challenge.answers import FAILED, CaseAnswer, auc, read_answer
 from challenge.design import TIERS
 from challenge.mechanism import NONE, UNKNOWN
 from challenge.results import check_results
-from challenge.seal import open_key
+from challenge.seal import open_answers
 
 type Array = NDArray[np.float64]
 
@@ -193,19 +194,23 @@ class Score:
         Every case of the key, failed ones included.
     warnings : tuple of str
         What could not be made sure of.
+    seconds : mapping of str to float
+        How long each case took, where that was recorded.
     """
 
     tiers: dict[str, TierScore]
     answers: tuple[CaseAnswer, ...]
     warnings: tuple[str, ...] = ()
+    seconds: Mapping[str, float] = field(default_factory=dict)
 
 
-def _share(answers: Iterable[CaseAnswer], hit: Callable[[CaseAnswer], bool]) -> Proportion:
+def share_of[T](answers: Iterable[T], hit: Callable[[T], bool]) -> Proportion:
+    """Return how many of some answers are hits."""
     hits = [hit(answer) for answer in answers]
     return Proportion(sum(hits), len(hits))
 
 
-def _average(values: list[float], statistic: Callable[..., np.ndarray]) -> Average:
+def average(values: list[float], statistic: Callable[..., np.ndarray]) -> Average:
     """Return a statistic with a bootstrap interval, the same for the same values."""
     if not values:
         return Average(float("nan"), (float("nan"), float("nan")), 0)
@@ -215,14 +220,15 @@ def _average(values: list[float], statistic: Callable[..., np.ndarray]) -> Avera
     return Average(float(statistic(data)), (low, high), len(values))
 
 
-def _over(stated: Array, statistic: Callable[[Array], float]) -> Average:
+def over(stated: Array, statistic: Callable[[Array], float]) -> Average:
     """Return a statistic of columns (probability, outcome) with a bootstrap interval."""
     n = stated.shape[1]
     if not n:
-        return _average([], np.mean)
+        return average([], np.mean)
     rng = np.random.default_rng(0)
     again = [statistic(stated[:, rng.integers(0, n, n)]) for _ in range(400)]
-    low, high = (float(q) for q in np.nanquantile(again, [0.025, 0.975]))
+    again = [value for value in again if value == value] or [float("nan")]
+    low, high = (float(q) for q in np.quantile(again, [0.025, 0.975]))
     return Average(statistic(stated), (low, high), n)
 
 
@@ -231,7 +237,7 @@ def _auc(stated: Array) -> float:
     return float("nan") if found is None else found
 
 
-def _calibration_error(stated: Array) -> float:
+def calibration_error(stated: Array) -> float:
     """Mean distance of stated probability and frequency over ten bins, weighted by their counts."""
     place = np.minimum((stated[0] * _BINS).astype(int), _BINS - 1)
     sums = [np.bincount(place, weights=s, minlength=_BINS) for s in stated]
@@ -244,7 +250,7 @@ def _reliability(answers: list[CaseAnswer]) -> tuple[ReliabilityBin, ...]:
     for i in range(_BINS):
         inside = [a for a in answers if min(int(a.confidence * _BINS), _BINS - 1) == i]
         mean = float(np.mean([a.confidence for a in inside])) if inside else float("nan")
-        correct = _share(inside, lambda a: a.called in a.right)
+        correct = share_of(inside, lambda a: a.called in a.right)
         bins.append(ReliabilityBin(float(edges[i]), float(edges[i + 1]), mean, correct))
     return tuple(bins)
 
@@ -291,70 +297,73 @@ def score_tier(tier: str, answers: list[CaseAnswer]) -> TierScore:
         tier=tier,
         n_cases=len(answers),
         n_failed=sum(a.verdict == FAILED for a in answers),
-        top_1=_share(gaps, lambda a: a.among_first(1)),
-        top_2=_share(gaps, lambda a: a.among_first(2)),
-        top_1_all=_share(answers, lambda a: a.among_first(1)),
-        top_2_all=_share(answers, lambda a: a.among_first(2)),
-        truth_probability=_average([a.truth_probability for a in gaps], np.mean),
-        truth_probability_all=_average([a.truth_probability for a in answers], np.mean),
-        false_alarm=_share(nulls, lambda a: a.verdict != NONE),
-        unlisted_recognised=_share(unlisted, lambda a: a.verdict in (UNKNOWN, "ambiguous")),
-        listed_called_unknown=_share(listed, lambda a: a.verdict in (UNKNOWN, FAILED)),
-        confidently_wrong=_share(answers, lambda a: a.confidently_wrong()),
-        localisation_auc=_average([a.auc for a in gaps if a.auc is not None], np.median),
+        top_1=share_of(gaps, lambda a: a.among_first(1)),
+        top_2=share_of(gaps, lambda a: a.among_first(2)),
+        top_1_all=share_of(answers, lambda a: a.among_first(1)),
+        top_2_all=share_of(answers, lambda a: a.among_first(2)),
+        truth_probability=average([a.truth_probability for a in gaps], np.mean),
+        truth_probability_all=average([a.truth_probability for a in answers], np.mean),
+        false_alarm=share_of(nulls, lambda a: a.verdict != NONE),
+        unlisted_recognised=share_of(unlisted, lambda a: a.verdict in (UNKNOWN, "ambiguous")),
+        listed_called_unknown=share_of(listed, lambda a: a.verdict in (UNKNOWN, FAILED)),
+        confidently_wrong=share_of(answers, lambda a: a.confidently_wrong()),
+        localisation_auc=average([a.auc for a in gaps if a.auc is not None], np.median),
         shrink_coverage=Proportion(sum(s.covered for s in stated), len(stated)),
         no_shrink_interval=Proportion(len(shrinks) - len(stated), len(shrinks)),
-        actual_shrink=_average([s.actual for s in shrinks], np.median),
-        told_apart=_average([a.told_apart for a in gaps if a.told_apart is not None], np.mean),
-        brier=_average([a.brier for a in answers], np.mean),
+        actual_shrink=average([s.actual for s in shrinks], np.median),
+        told_apart=average([a.told_apart for a in gaps if a.told_apart is not None], np.mean),
+        brier=average([a.brier for a in answers], np.mean),
         reliability=_reliability([a for a in answers if a.ranked]),
         included=Proportion(sum(c.probability >= 0.5 for c in acting), len(acting)),
         wrongly_included=Proportion(sum(c.probability >= 0.5 for c in absent), len(absent)),
-        inclusion_auc=_over(stating, _auc),
-        inclusion_brier=_over(stating, lambda s: float(np.mean((s[0] - s[1]) ** 2))),
-        inclusion_error=_over(stating, _calibration_error),
-        share_coverage=Proportion(sum(c.covered for c in acting), len(acting)),
+        inclusion_auc=over(stating, _auc),
+        inclusion_brier=over(stating, lambda s: float(np.mean((s[0] - s[1]) ** 2))),
+        inclusion_error=over(stating, calibration_error),
+        share_coverage=share_of([c for c in acting if c.share == c.share], lambda c: c.covered),
         by_itself=_by_itself(answers, stating),
     )
 
 
 def score(
-    cases_dir: Path, results_dir: Path, key_path: Path, outputs: Collection[str] = ()
+    cases_dir: Path, results_dir: Path, answers_dir: Path, outputs: Collection[str] = ()
 ) -> Score:
     """Score the diagnoses of a blind test.
 
     Parameters
     ----------
     cases_dir : Path
-        Folder that `challenge.make.make` wrote.
+        Folder with a folder for each case.
     results_dir : Path
         Folder with ``<case>/diagnosis.json`` and ``<case>/fresh_prediction.csv``.
-    key_path : Path
-        The sealed key.
+    answers_dir : Path
+        Folder with ``<case>/answer.json``.
     outputs : collection of str
         Score the cases that measure these and no others; all cases by default.
 
     Raises
     ------
     CalibError
-        If no case measures these outputs, the key does not match the hash published with the
-        cases, there is no diagnosis, or diagnoses are of other cases.
+        If no case measures these outputs, an answer does not match the hash in its case, there is
+        no diagnosis, or diagnoses are of other cases.
     """
-    entries = open_key(cases_dir, key_path)["cases"]
-    warnings = check_results(cases_dir, results_dir, sorted(entries))
-    answers = [read_answer(name, entries[name], results_dir / name) for name in sorted(entries)]
+    known = open_answers(cases_dir, answers_dir)
+    warnings = check_results(cases_dir, results_dir, sorted(known))
+    answers = [read_answer(name, known[name], results_dir / name) for name in sorted(known)]
+    if rest := {path.parent.name for path in cases_dir.glob("*/case.toml")} - {*known}:
+        warnings += (f"{len(rest)} cases have no answer and are not scored, one is {min(rest)}",)
     if outputs:
+        there = sorted({",".join(sorted(a.outputs)) for a in answers})
         answers = [a for a in answers if set(a.outputs) == set(outputs)]
         if not answers:
-            there = sorted({",".join(sorted(entry["noise_sd"])) for entry in entries.values()})
             raise CalibError(
                 f"no case measures {' and '.join(outputs)} alone", where=str(cases_dir),
                 expected="; ".join(there), hint="name the outputs of some cases, or leave them out",
             )  # fmt: skip
-    tiers = {tier: [a for a in answers if a.tier == tier] for tier in TIERS}
-    tiers = {tier: part for tier, part in tiers.items() if part}
+    tiers = {tier: [a for a in answers if a.tier == tier]
+             for tier in dict.fromkeys([*TIERS, *(a.tier for a in answers)])}  # fmt: skip
     return Score(
-        tiers={tier: score_tier(tier, part) for tier, part in tiers.items()},
+        tiers={tier: score_tier(tier, part) for tier, part in tiers.items() if part},
         answers=tuple(answers),
         warnings=warnings,
+        seconds=read_seconds(results_dir),
     )

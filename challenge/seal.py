@@ -1,24 +1,25 @@
-"""The sealed key: written outside the cases, its hash published with them.
+"""The withheld answers: written outside the cases, the hash of each in its case.
 
-A diagnosis never takes a key's path, and nothing in a case folder leads to one. Whoever holds
-the key later proves with the published hash that it was not changed after the fact.
+A diagnosis never takes an answer's path, and nothing in a case folder leads to one. Whoever holds
+the answers later proves with the hashes that they were not changed after the fact.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
+import re
+import tomllib
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from calib.batch.folders import alone, check_room, writing
 from calib.errors import CalibError
+from challenge.format import Answer, read_document
 
-KEY_SCHEMA = "calib/challenge-key/1"
-MANIFEST_SCHEMA = "calib/challenge/1"
-MANIFEST_NAME, HASH_NAME = "manifest.json", "HASH"
+ANSWER, ANSWER_SCHEMA = "answer.json", "calib/answer/1"
 
 
 def sha256(data: bytes) -> str:
@@ -26,40 +27,29 @@ def sha256(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def commitment(seed: int, salt: str) -> str:
-    """Return a commitment to a seed that does not give it away."""
-    return sha256(f"{salt}:{seed}".encode())
-
-
-def check_new(cases_dir: Path, key_path: Path) -> None:
-    """Check where cases and their key are to be written.
+def check_new(cases_dir: Path, answers_dir: Path) -> None:
+    """Check where cases and their answers are to be written.
 
     Raises
     ------
     CalibError
-        If the key would lie with the cases, or something is there already.
+        If the answers would lie with the cases, or something is there already.
     """
-    if key_path.resolve().is_relative_to(cases_dir.resolve()):
+    if answers_dir.resolve().is_relative_to(cases_dir.resolve()):
         raise CalibError(
-            "the key must not lie with the cases that it answers",
-            where=str(key_path),
+            "the answers must not lie with the cases",
+            where=str(answers_dir),
             expected=f"a path outside {cases_dir}",
-            hint="choose another path for the key",
+            hint="choose another path for the answers",
         )
-    if cases_dir.exists() and any(cases_dir.iterdir()):
-        raise CalibError(
-            "the folder is not empty",
-            where=str(cases_dir),
-            hint="choose a new folder, so that cases of two tests cannot mix",
-        )
-    for path in (cases_dir, key_path):
+    for path in (cases_dir, answers_dir):
+        if path.exists() and (not path.is_dir() or any(path.iterdir())):
+            raise CalibError(
+                "the folder is not empty",
+                where=str(path),
+                hint="choose a new folder, so that cases of two tests cannot mix",
+            )
         check_room(path)
-    if key_path.exists():
-        raise CalibError(
-            "a key is there already",
-            where=str(key_path),
-            hint="choose another path; without its key a test cannot be scored",
-        )
 
 
 @contextmanager
@@ -71,85 +61,69 @@ def new_folder(cases_dir: Path) -> Iterator[None]:
         yield
 
 
-def seal(key: dict[str, Any], key_path: Path) -> str:
-    """Write a key and return its SHA-256.
+def write_case(
+    folder: Path, files: Mapping[str, str], answers_dir: Path, answer: Mapping[str, Any]
+) -> None:
+    """Write a case, and its answer, readable by its owner only, into a folder of its name.
 
     Parameters
     ----------
-    key : dict
-        Content with ``seed`` and ``salt``.
-    key_path : Path
-        Where to write; readable by its owner only.
+    folder : Path
+        Of the case.
+    files : mapping of str to str
+        Name to text; ``case.toml`` without the hash, or with that of another answer.
+    answers_dir : Path
+        Of the answers of all cases.
+    answer : mapping
+        Content without ``schema``.
     """
-    data = (json.dumps(key, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
-    with writing(key_path):
-        key_path.parent.mkdir(parents=True, exist_ok=True)
-        key_path.write_bytes(data)
-        key_path.chmod(0o600)
-    return sha256(data)
+    content = {"schema": ANSWER_SCHEMA, **answer}
+    data = (json.dumps(content, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
+    path = answers_dir / folder.name / ANSWER
+    with writing(folder), writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+        path.chmod(0o600)
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, text in files.items():
+            if name == "case.toml":
+                text = re.sub("^answer_sha256 = .*\n", "", text, flags=re.M)
+                text = f'answer_sha256 = "{sha256(data)}"\n{text}'
+            (folder / name).write_text(text, encoding="utf-8")
 
 
-def publish(cases_dir: Path, key: dict[str, Any], digest: str, tiers: tuple[str, ...]) -> None:
-    """Write what everybody may know: number of cases, tiers, the key's hash, a seed commitment."""
-    manifest = {
-        "schema": MANIFEST_SCHEMA,
-        "n_cases": len(key["cases"]),
-        "tiers": list(tiers),
-        "key_sha256": digest,
-        "seed_commitment": commitment(key["seed"], key["salt"]),
-    }
-    text = json.dumps(manifest, indent=1, sort_keys=True) + "\n"
-    (cases_dir / MANIFEST_NAME).write_text(text, encoding="utf-8")
-    (cases_dir / HASH_NAME).write_text(digest + "\n", encoding="utf-8")
-
-
-def published_hash(cases_dir: Path) -> str:
-    """Return the hash that was published with the cases.
+def open_answers(cases_dir: Path, answers_dir: Path) -> dict[str, Answer]:
+    """Return answers by the names of their cases, checked against the hashes in these.
 
     Raises
     ------
     CalibError
-        If there is none.
+        If there are none, or one cannot be read, was changed or is of another case.
     """
-    try:
-        manifest = json.loads((cases_dir / MANIFEST_NAME).read_bytes())
-        return str(manifest["key_sha256"])
-    except (OSError, ValueError, KeyError, TypeError) as problem:
+    found: dict[str, Answer] = {}
+    for where in sorted(answers_dir.glob(f"*/{ANSWER}")):
+        path = cases_dir / where.parent.name / "case.toml"
+        found[where.parent.name], digest = read_document(where, Answer)
+        if (said := _published(path)) != digest:
+            raise CalibError(
+                f"the answer's SHA-256 is {digest}",
+                where=str(where),
+                expected=f"the published answer_sha256, {said}, of {path}",
+                hint="use the answers that were written together with these cases, unchanged",
+            )
+    if not found:
         raise CalibError(
-            f"no published key hash can be read ({type(problem).__name__})",
-            where=str(cases_dir / MANIFEST_NAME),
-            expected="the manifest that was written with the cases",
-            hint="point to the folder that `calib challenge make` wrote",
-        ) from problem
-
-
-def open_key(cases_dir: Path, key_path: Path) -> dict[str, Any]:
-    """Return the key's content after checking it against the published hash.
-
-    Raises
-    ------
-    CalibError
-        If the key cannot be read, was changed or belongs to other cases.
-    """
-    expected = published_hash(cases_dir)
-    try:
-        data = key_path.read_bytes()
-    except OSError as problem:
-        raise CalibError(
-            f"the key cannot be read ({problem.strerror})", where=str(key_path)
-        ) from problem
-    if sha256(data) != expected:
-        raise CalibError(
-            f"the key's SHA-256 is {sha256(data)}",
-            where=str(key_path),
-            expected=f"the published {expected}",
-            hint="use the key that was written together with these cases, unchanged",
+            "there are no answers",
+            where=str(answers_dir),
+            expected=f"a folder with an {ANSWER} in a folder for each case",
+            hint="point to the answers that `calib challenge make` wrote",
         )
-    key: dict[str, Any] = json.loads(data)
-    if key.get("schema") != KEY_SCHEMA:
-        raise CalibError(
-            f"the key has the schema {key.get('schema')!r}",
-            where=str(key_path),
-            expected=KEY_SCHEMA,
-        )
-    return key
+    return found
+
+
+def _published(path: Path) -> str | None:
+    try:
+        said: str | None = tomllib.loads(path.read_text(encoding="utf-8-sig")).get("answer_sha256")
+    except (OSError, ValueError):
+        return None
+    return said

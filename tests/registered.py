@@ -17,6 +17,7 @@ def forgotten(*registries: Registry) -> Iterator[None]:
     before = [set(registry) for registry in registries]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(user_code, "_loaded", {})
+        patch.setattr(user_code, "_content", dict(user_code._content))
         yield
     for registry, names in zip(registries, before, strict=True):
         for name in set(registry) - names:

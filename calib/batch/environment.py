@@ -147,27 +147,13 @@ def code_sha256() -> str:
     files = {
         f"priors/{path.relative_to(priors).as_posix()}": path for path in priors.rglob("*.toml")
     }
-    return _digest(files | _sources(package, but=packaged))
-
-
-@cache
-def source_sha256(package: Path) -> str:
-    """Return the SHA-256 over the source files in the folder of a package."""
-    return _digest(_sources(package))
-
-
-def _sources(package: Path, but: Path | None = None) -> dict[str, Path]:
-    """Return the source files of a package, those of one of its folders left out."""
-    return {
+    files |= {
         path.relative_to(package).as_posix(): path
         for path in package.rglob("*")
         if path.suffix in (".py", ".j2", ".css", ".js", ".toml")
         and path.is_file()
-        and but not in path.parents
+        and packaged not in path.parents
     }
-
-
-def _digest(files: Mapping[str, Path]) -> str:
     digest = hashlib.sha256()
     for name, path in sorted(files.items()):
         # Line ends are the checkout's, not the code's.

@@ -11,6 +11,7 @@ import typer
 from calib.batch.environment import from_the_bench
 from calib.cli import options as opt
 from calib.cli.options import announce, finish, progress_bars
+from calib.errors import CalibError
 
 
 def _tell_failed(failed: Mapping[str, str]) -> None:
@@ -35,7 +36,7 @@ def campaign(
     simulator: opt.Simulators = None,
     json: opt.Json = False,
 ) -> None:
-    """Run many fits, diagnoses, challenge cases or SBC replicates; run again to resume."""
+    """Run many fits, diagnoses or SBC replicates; run again to resume."""
     from calib.batch.campaign import read_plan, run_campaign
     from calib.data.reader import SEEN
 
@@ -111,7 +112,7 @@ def sbc(
 
 
 _Cases = Annotated[Path, typer.Argument(help="Folder with cases.")]
-_Key = Annotated[Path, typer.Option(help="File with the sealed answers.")]
+_Key = Annotated[Path, typer.Option(help="Folder with the answers.")]
 
 challenge = typer.Typer(
     cls=opt.Group, no_args_is_help=True, help="The blind test of the diagnosis."
@@ -120,11 +121,11 @@ challenge = typer.Typer(
 
 @challenge.command(
     cls=opt.Command,
-    epilog="Example: calib challenge make --out cases --key key.json --seed 1 --cases 20",
+    epilog="Example: calib challenge make --out cases --key answers --seed 1 --cases 20",
 )
 def make(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the cases.")],
-    key: Annotated[Path, typer.Option(help="File for the sealed answers, outside it.")],
+    key: Annotated[Path, typer.Option(help="Folder for the answers, outside it.")],
     seed: opt.Seed,
     cases: Annotated[int, typer.Option(help="Number of cases.", min=1)] = 300,
     tier: Annotated[
@@ -135,17 +136,17 @@ def make(
     scheduler: opt.Scheduler = None,
     json: opt.Json = False,
 ) -> None:
-    """Write cases of known cause, and their answers into a sealed key."""
+    """Write cases of known cause, and their answers into another folder."""
     with from_the_bench("calib challenge make"):
         from challenge.make import make as make_cases
     with progress_bars() as tell:
-        digest = make_cases(
+        make_cases(
             out, key, seed=seed, n_cases=cases, workers=workers, scheduler=scheduler,
             tiers=("easy", "hard") if tier == "both" else (tier,),
             progress=lambda done, n: tell("making cases", done, n),
         )  # fmt: skip
-    print(f"{cases} cases in {out}; the key's SHA-256 is {digest}")
-    finish(0, {"folder": str(out), "cases": cases, "key_sha256": digest})
+    print(f"{cases} cases in {out}, their answers in {key}")
+    finish(0, {"folder": str(out), "cases": cases})
 
 
 @challenge.command(cls=opt.Command, epilog="Example: calib challenge run cases --out diagnoses")
@@ -157,16 +158,29 @@ def run(
     seed: opt.Seed = 1,
     workers: opt.Workers = 2,
     scheduler: opt.Scheduler = None,
+    program: Annotated[
+        str, typer.Option(help="Another program's command, such as 'python rival.py {case} {out}'.")
+    ] = "",
+    limit: Annotated[float, typer.Option(help="Seconds it may take for a case.", min=0.1)] = 3600.0,
     plugins: opt.Models = None,
     json: opt.Json = False,
 ) -> None:
-    """Diagnose every case of a folder; run again to resume."""
+    """Diagnose every case of a folder, by calib or another program; run again to resume."""
+    from functools import partial
+
     from calib.gap.batch import case_folders, diagnose_cases
 
     cases = case_folders(folder)
+    diagnosed = partial(diagnose_cases, cases, out, seed, scheduler=scheduler)
+    if program:
+        if scheduler:
+            raise CalibError("--program runs on this machine alone", hint="leave --scheduler out")
+        with from_the_bench("calib challenge run --program"):
+            from challenge.programs import run_programs
+        diagnosed = partial(run_programs, program, cases, out, limit=limit)
     with progress_bars() as tell:
-        failed = diagnose_cases(
-            cases, out, seed, workers=workers, scheduler=scheduler, announce=announce,
+        failed = diagnosed(
+            workers=workers, announce=announce,
             progress=lambda done, n: tell("diagnosing", done, n),
         )  # fmt: skip
     _tell_failed(failed)
@@ -177,14 +191,14 @@ def run(
 @challenge.command(
     "well-specified",
     cls=opt.Command,
-    epilog="Example: calib challenge well-specified cases --key key.json --out plain --out-key "
-    "plain.json",
+    epilog="Example: calib challenge well-specified cases --key answers --out plain --out-key "
+    "plain-answers",
 )
 def well_specified(
     folder: _Cases,
     key: _Key,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the well-specified cases.")],
-    out_key: Annotated[Path, typer.Option(help="File for their answers, outside it.")],
+    out_key: Annotated[Path, typer.Option(help="Folder for their answers, outside it.")],
     seed: opt.Seed = 1,
     workers: opt.Workers = 2,
     scheduler: opt.Scheduler = None,
@@ -211,12 +225,15 @@ def well_specified(
 
 @challenge.command(
     cls=opt.Command,
-    epilog="Example: calib challenge score cases --results diagnoses --key key.json",
+    epilog="Example: calib challenge score cases --results diagnoses --key answers",
 )
 def score(
     ctx: typer.Context,
     folder: _Cases,
-    results: Annotated[Path, typer.Option(help="Folder with the diagnoses.")],
+    results: Annotated[
+        list[str],
+        typer.Option(help="Folder with the diagnoses; NAME=FOLDER for each of several programs."),
+    ],
     key: _Key,
     outputs: Annotated[
         str,
@@ -225,13 +242,20 @@ def score(
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for the table and figures.")
     ] = None,
+    page: Annotated[
+        Path | None, typer.Option(help="Markdown page for a table and a figure of all programs.")
+    ] = None,
+    section: Annotated[
+        str, typer.Option(help="Name of the cases on that page; by default the folder's.")
+    ] = "",
     overwrite: opt.Overwrite = False,
     json: opt.Json = False,
 ) -> None:
-    """Compare diagnoses with the sealed answers."""
+    """Compare diagnoses with the answers; with --out or --json those of the first program."""
     from dataclasses import asdict
 
     with from_the_bench("calib challenge score"):
+        from challenge.board import named_folders, write_board
         from challenge.figures import levels_figure, reliability_figure
         from challenge.score import score as score_all
         from challenge.table import text_table
@@ -239,11 +263,17 @@ def score(
 
     if out is not None:
         ctx.with_resource(claimed(out, overwrite=overwrite))
-    found = score_all(folder, results, key, [o.strip() for o in outputs.split(",") if o.strip()])
+    only = [o.strip() for o in outputs.split(",") if o.strip()]
+    scores = {n: score_all(folder, d, key, only) for n, d in named_folders(results).items()}
+    for name, one in scores.items():
+        for warning in one.warnings:
+            announce(f"{name}: {warning}")
+        print(*[f"{name}\n"] * (len(scores) > 1), text_table(one), sep="\n")
+    found = next(iter(scores.values()))
     table = text_table(found)
-    for warning in found.warnings:
-        announce(warning)
-    print(table)
+    if page is not None:
+        write_board(page, section or folder.resolve().name, scores)
+        print(page)
     if out is not None:
         with fresh_folder(out, overwrite=overwrite) as scratch:
             (scratch / "score.txt").write_text(table + "\n", encoding="utf-8")

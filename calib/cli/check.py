@@ -138,17 +138,44 @@ def _short(value: Any) -> str:
 
 
 def validate(
-    reference: Annotated[Path, typer.Argument(help="Run folder of `calib fit`.")],
-    file: Annotated[Path, typer.Argument(help="CSV of your readings, of another campaign.")],
+    reference: Annotated[Path, typer.Argument(help="Run folder of `calib fit`, or a case folder.")],
+    file: Annotated[
+        Path | None, typer.Argument(help="CSV of your readings, of another campaign than the run.")
+    ] = None,
+    answer: Annotated[
+        Path | None, typer.Option(help="The case's answer.json; needs a checkout.")
+    ] = None,
+    diagnosis: Annotated[
+        Path | None, typer.Option(help="Folder with a diagnosis of the case; needs a checkout.")
+    ] = None,
     plugins: opt.Models = None,
     simulator: opt.Simulators = None,
     json: opt.Json = False,
 ) -> None:
-    """Judge whether your readings are consistent with a reference campaign.
+    """Judge whether your readings are consistent with a reference campaign, or check a case.
 
-    Ends with 0 where they are, 1 where they are not, 2 where no row can be judged, 3 where the
-    reference did not converge.
+    Of a run it ends with 0 where they are, 1 where they are not, 2 where no row can be judged, 3
+    where the reference did not converge. Of a case folder it lists everything that does not follow
+    the format, of the answer and the diagnosis too, and ends with 0 if there is nothing, 1 if there
+    is.
     """
+    if file is None:
+        from calib.batch.environment import from_the_bench
+        from calib.gap.validator import faults
+
+        all_faults = faults(reference)
+        if answer is not None or diagnosis is not None:
+            with from_the_bench("calib validate --answer, --diagnosis"):
+                from challenge.format import faults as of_others
+            all_faults += of_others(reference, answer, diagnosis)
+        wrong = [*map(str, all_faults)]
+        print(*wrong, f"{reference}: {len(wrong) or 'no'} faults", sep="\n")
+        finish(1 if wrong else 0, {"folder": str(reference), "faults": wrong})
+        return
+    if answer is not None or diagnosis is not None:
+        raise CalibError(
+            "--answer and --diagnosis are of a case", where=str(file), hint="leave FILE out"
+        )
     from calib import consistency, load_calibration
     from calib.data import read_for_model
     from calib.report.verdict import kept_verdict

@@ -129,20 +129,23 @@ def _raise_any(problems: Sequence[Fault], source: str, place: str = "line") -> N
         column = f", column {problem.column!r}" if problem.column else ""
         return f"{place} {problem.line}{column}"
 
+    each = [
+        CalibError(p.found, where=f"{source}, {at(p)}", expected=p.expected, hint=p.hint)
+        for p in sorted(problems)
+    ]
+    if len(each) == 1:
+        raise each[0]
     shown = sorted(problems)[:5]
-    if len(problems) == 1:
-        only = shown[0]
-        raise CalibError(
-            only.found, where=f"{source}, {at(only)}", expected=only.expected, hint=only.hint
-        )
     rows = [f"  {at(p)}: {p.found}; expected: {p.expected}" for p in shown]
     rows += [f"  and {len(problems) - 5} more"] * (len(problems) > 5)
     hints = list(dict.fromkeys(p.hint for p in shown))
-    raise CalibError(
+    error = CalibError(
         "\n".join([f"{len(problems)} problems in the data", *rows]),
         where=source,
         hint=hints[0] if len(hints) == 1 else "".join(f"\n    - {hint}" for hint in hints),
     )
+    error.each = tuple(each)
+    raise error
 
 
 def _check_first_line(file: CsvFile, where: str) -> None:

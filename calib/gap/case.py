@@ -126,6 +126,8 @@ class CaseFile(_Strict):
     priors: dict[str, str] = {}
     covariates: dict[str, str | list[str]] = {}
     context: Context | None = None
+    simulations: dict[str, str] = {}
+    answer_sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")] | None = None
 
 
 @dataclass(frozen=True)
@@ -199,10 +201,10 @@ def read_case(folder: Path) -> Case:
             hint="correct the name",
         )
     missing_ok = tuple(OUTPUTS.values())
-    lab = read_table(_inside(folder, "calibration", written.calibration), allow_missing=missing_ok)
-    field = read_table(_inside(folder, "field", written.field), allow_missing=missing_ok)
-    new = read_table(_inside(folder, "predict", written.predict)) if written.predict else None
-    priors = _read_priors(folder, written)
+    lab = read_table(inside(folder, "calibration", written.calibration), allow_missing=missing_ok)
+    field = read_table(inside(folder, "field", written.field), allow_missing=missing_ok)
+    new = read_table(inside(folder, "predict", written.predict)) if written.predict else None
+    priors = read_priors(folder, written)
     tables = (lab, field) if new is None else (lab, field, new)
     own = declared_covariates(written.covariates, tables)
     return Case(
@@ -291,7 +293,7 @@ def read_context(content: Any, where: str) -> Context:
     return context
 
 
-def _read_priors(folder: Path, written: CaseFile) -> dict[str, DeclaredPriors]:
+def read_priors(folder: Path, written: CaseFile) -> dict[str, DeclaredPriors]:
     """Read the prior files of a case's simulators; what is in them is checked with the models."""
     where = f"{folder / 'case.toml'}, [priors]"
     found = {}
@@ -303,7 +305,7 @@ def _read_priors(folder: Path, written: CaseFile) -> dict[str, DeclaredPriors]:
                 expected=f"the name of a prior file for any of {', '.join(written.models)}",
                 hint="correct the name of the output, or leave it out",
             )
-        path = _inside(folder, output, name)
+        path = inside(folder, output, name)
         try:
             found[output] = DeclaredPriors(path.name, read_text(path))
         except (OSError, UnicodeDecodeError) as error:
@@ -315,7 +317,7 @@ def _read_priors(folder: Path, written: CaseFile) -> dict[str, DeclaredPriors]:
     return found
 
 
-def _inside(folder: Path, key: str, name: str) -> Path:
+def inside(folder: Path, key: str, name: str) -> Path:
     """Return the path of a file of the case, which opens no others: it may be from elsewhere."""
     path = folder / name
     if not _is_inside(path, folder):

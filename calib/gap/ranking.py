@@ -154,7 +154,7 @@ def rank(
     unable |= dict.fromkeys(design.idle, "it changes nothing that the models of this case predict")
     single = [replace(h, share=shares[h.name] or 1.0) for h in single]
     context = data.case.context
-    _check_names(context, {*able, *unable})
+    check_names(context, {*able, *unable})
     single = [with_known_size(h, context) for h in single if h.name not in context.excluded]
     unable |= dict.fromkeys(context.excluded, "it is excluded in the case's [context]")
     alone -= set(context.excluded)
@@ -284,7 +284,7 @@ def _with_residuals(screen: Screen, odds: Odds, found: Sequence[Candidate]) -> l
     return more
 
 
-def _check_names(context: Context, known: set[str]) -> None:
+def check_names(context: Context, known: set[str]) -> None:
     """Refuse a context with causes that nobody knows, or that cannot be taken out."""
     always = ("parameter_shift", "unknown")
     for name in (*context.excluded, *context.sizes):

@@ -1,8 +1,9 @@
-"""Measured cases as they are stored, and the case folders that `calib diagnose` reads."""
+"""Measured cases as they are stored, and the folders of cases and answers that are made of them."""
 
 from __future__ import annotations
 
 import csv
+import io
 import math
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -14,6 +15,8 @@ import numpy as np
 
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
+from challenge.mechanism import UNKNOWN
+from challenge.seal import write_case
 
 __all__ = ["HERE", "NONE", "SIMULATORS", "UNLISTED", "MeasuredCase", "read_cases"]
 
@@ -22,6 +25,7 @@ HERE = Path(__file__).parent
 SIMULATORS = tuple(p for p in sorted(HERE.glob("*.py")) if "\nregister(" in p.read_text("utf-8"))
 NONE, UNLISTED = "none", "unlisted"
 _SERIES = "series"
+_FEWEST = 5  # field rows of a case
 
 type Rows = list[dict[str, str]]
 
@@ -61,17 +65,53 @@ class MeasuredCase:
     defensible: tuple[str, ...]
     sizes: Mapping[str, float]
 
-    def write(self, folder: Path) -> None:
-        """Write the folder that `calib diagnose` reads; it does not hold the answer."""
-        folder.mkdir(parents=True)
-        for stem, rows in (("lab", self.lab), ("field", self.field)):
-            with (folder / f"{stem}.csv").open("w", encoding="utf-8", newline="") as file:
-                writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-                writer.writeheader()
-                writer.writerows(rows)
+    def write(self, folder: Path, answers: Path, leave_out: int = 0) -> None:
+        """Write the case folder, and its answer into a folder of its name among the answers.
+
+        Parameters
+        ----------
+        folder, answers : Path
+        leave_out : int, optional
+            Of so many field rows one is left out of the field, to be predicted.
+        """
+        # Of a quantity of the bench's own too, which is registered where a program reads the case.
+        columns = {o: next(c for c in self.field[0] if c.startswith(f"{o}_")) for o in self.models}
+        whole = [i for i, row in enumerate(self.field) if all(row[c] for c in columns.values())]
+        kept = whole[leave_out // 2 :: leave_out] if leave_out else []
+        fresh = [self.field[i] for i in kept] if len(self.field) - len(kept) >= _FEWEST else []
+        field = [row for row in self.field if row not in fresh]
         models = "".join(f'{output} = "{model}"\n' for output, model in self.models.items())
-        text = f'calibration = "lab.csv"\nfield = "field.csv"\n\n[models]\n{models}'
-        (folder / "case.toml").write_text(text, encoding="utf-8")
+        predict = 'predict = "fresh.csv"\n' if fresh else ""
+        files = {
+            "case.toml": f'calibration = "lab.csv"\nfield = "field.csv"\n{predict}\n'
+            f"[models]\n{models}",
+            "lab.csv": _text(self.lab),
+            "field.csv": _text(field),
+        }
+        answer: dict[str, Any] = {
+            "tier": "measured",
+            "truth": UNKNOWN if self.expected == UNLISTED else self.expected,
+            "defensible": list(self.defensible),
+            "cause": self.cause,
+            "laboratory": self.laboratory,
+        }
+        if fresh:
+            outputs = {*columns.values()}
+            files["fresh.csv"] = _text(
+                [{c: v for c, v in row.items() if c not in outputs} for row in fresh]
+            )
+            answer["fresh_truth"] = {
+                o: [float(row[c]) for row in fresh] for o, c in columns.items()
+            }
+        write_case(folder, files, answers, answer)
+
+
+def _text(rows: Rows) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
 
 
 def read_cases(folder: Path = HERE) -> tuple[MeasuredCase, ...]:

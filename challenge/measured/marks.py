@@ -2,86 +2,41 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 
-from challenge.measured.cases import NONE, UNLISTED, MeasuredCase
+from challenge.answers import CaseAnswer, CauseAnswer
+from challenge.measured.cases import MeasuredCase
+from challenge.mechanism import NONE, UNKNOWN
 from challenge.score import Proportion
 
-__all__ = ["Mark", "mark", "markdown"]
-
-FAILED = "failed"
+__all__ = ["documented", "markdown", "wrong"]
 
 
-@dataclass(frozen=True)
-class Mark:
-    """One case's diagnosis against its documented cause.
-
-    Parameters
-    ----------
-    case : MeasuredCase
-    verdict : str
-        As stated; ``failed`` without a diagnosis.
-    inclusion : tuple of (str, float)
-        Listed causes and the probabilities that they act, the most probable first.
-    remainder : float
-        Probability of something unlisted.
-    first : str
-        The most probable explanation.
-    """
-
-    case: MeasuredCase
-    verdict: str
-    inclusion: tuple[tuple[str, float], ...]
-    remainder: float
-    first: str
-
-    @property
-    def cause(self) -> float:
-        """Probability given to the documented cause; NaN of none."""
-        if self.case.expected == NONE:
-            return float("nan")
-        if self.case.expected == UNLISTED:
-            return self.remainder
-        return dict(self.inclusion).get(self.case.expected, 0.0)
-
-    def wrong(self, at: float) -> tuple[tuple[str, float], ...]:
-        """Listed causes that are said to act, at this probability or more, and are not it."""
-        right = {self.case.expected, *self.case.defensible}
-        return tuple((name, p) for name, p in self.inclusion if p >= at and name not in right)
+def documented(answer: CaseAnswer) -> float:
+    """Return the probability given to the documented cause, of several the least; NaN of none."""
+    stated = {c.name: c.probability for c in answer.causes}
+    causes = [] if answer.truth == NONE else answer.truth.split("+")
+    return min((stated.get(name, 0.0) for name in causes), default=float("nan"))
 
 
-def mark(case: MeasuredCase, folder: Path) -> Mark:
-    """Read the diagnosis of a case; one that is not there has failed.
-
-    Parameters
-    ----------
-    case : MeasuredCase
-    folder : Path
-        Of its diagnosis.
-    """
-    path = folder / "diagnosis.json"
-    if not path.exists():
-        return Mark(case, FAILED, (), 0.0, FAILED)
-    said = json.loads(path.read_bytes())
-    inclusion = {name: float(found["probability"]) for name, found in said["inclusion"].items()}
-    return Mark(
-        case, said["verdict"], tuple(sorted(inclusion.items(), key=lambda item: -item[1])),
-        float(said["remainder"]["probability"]), said["effects"][0]["name"],
-    )  # fmt: skip
+def wrong(answer: CaseAnswer, at: float) -> list[CauseAnswer]:
+    """Return listed causes that are said to act, at this probability or more, and do not."""
+    return [c for c in _listed(answer) if c.acts is False and c.probability >= at]
 
 
-def markdown(marks: Sequence[Mark]) -> str:
+def _listed(answer: CaseAnswer) -> list[CauseAnswer]:
+    return sorted((c for c in answer.causes if c.name != UNKNOWN), key=lambda c: -c.probability)
+
+
+def markdown(answers: Sequence[CaseAnswer], cases: Sequence[MeasuredCase]) -> str:
     """Return the scores and a table with a row for each case."""
-    gaps = [m for m in marks if m.case.expected != NONE]
-    nulls = [m for m in marks if m.case.expected == NONE]
+    gaps = [a for a in answers if a.truth != NONE]
+    nulls = [a for a in answers if a.truth == NONE]
     scores = (
-        ("documented cause included at 0.5 or more", gaps, lambda m: m.cause >= 0.5),
-        ("cases with another listed cause at 0.5 or more", marks, lambda m: bool(m.wrong(0.5))),
-        ("cases with another listed cause at 0.9 or more", marks, lambda m: bool(m.wrong(0.9))),
-        ("no gap, and a verdict other than none", nulls, lambda m: m.verdict != NONE),
+        ("documented cause included at 0.5 or more", gaps, lambda a: documented(a) >= 0.5),
+        ("cases with another listed cause at 0.5 or more", answers, lambda a: bool(wrong(a, 0.5))),
+        ("cases with another listed cause at 0.9 or more", answers, lambda a: bool(wrong(a, 0.9))),
+        ("no gap, and a verdict other than none", nulls, lambda a: a.verdict != NONE),
     )
     lines = ["| | cases | 95 % interval |", "|---|---|---|"]
     lines += [_score_line(*score) for score in scores]
@@ -89,26 +44,23 @@ def markdown(marks: Sequence[Mark]) -> str:
         "", "| case | documented | size, sds | verdict, first explanation | documented cause "
         "| other listed causes from 0.1 (of how many testable) | unlisted besides |",
         "|---|---|---|---|---|---|---|",
-        *(_case_line(m) for m in marks),
+        *(_case_line(a, case) for a, case in zip(answers, cases, strict=True)),
     ]  # fmt: skip
     return "\n".join(lines) + "\n"
 
 
-def _score_line(what: str, among: Sequence[Mark], hit: Callable[[Mark], bool]) -> str:
+def _score_line(what: str, among: Sequence[CaseAnswer], hit: Callable[[CaseAnswer], bool]) -> str:
     share = Proportion(sum(map(hit, among)), len(among))
     low, high = share.interval
     return f"| {what} | {share.successes}/{share.n} | {low:.2f} to {high:.2f} |"
 
 
-def _case_line(m: Mark) -> str:
-    others = ", ".join(_shown(name, p) for name, p in m.wrong(0.1)) or "-"
-    sizes = ", ".join(f"{size:g}" for size in m.case.sizes.values()) or "-"
-    cause = "-" if m.case.expected == NONE else _shown("", m.cause)
+def _case_line(a: CaseAnswer, case: MeasuredCase) -> str:
+    others = ", ".join(f"{c.name} {c.probability:.2f}" for c in wrong(a, 0.1)) or "-"
+    sizes = ", ".join(f"{size:g}" for size in case.sizes.values()) or "-"
+    cause = "-" if a.truth == NONE else f"{documented(a):.2f}"
+    unlisted = sum(c.probability for c in a.causes if c.name == UNKNOWN)
     return (
-        f"| {m.case.name} | {m.case.expected} | {sizes} | {m.verdict}, {m.first} | {cause} "
-        f"| {others} ({len(m.inclusion)}) | {m.remainder:.2f} |"
+        f"| {a.case} | {case.expected} | {sizes} | {a.verdict}, {a.called} | {cause} "
+        f"| {others} ({len(_listed(a))}) | {unlisted:.2f} |"
     )
-
-
-def _shown(name: str, probability: float) -> str:
-    return f"{name} {probability:.2f}".strip()

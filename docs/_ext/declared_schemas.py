@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from typing import Any
 
 from result_schemas import RESULTS
 
 from calib.batch.campaign.kinds import KINDS
 from calib.checking.check import Manifest
+from calib.gap.case import CaseFile
 from calib.imports.mapping import Mapped
 from calib.inference.io import RunRecord
 from calib.inference.prior_files import PriorFileContent
 from calib.models.simulators.files import SimulatorFile
 from calib.report.comparison import ComparisonRecord
+from challenge.format import Answer, Scored
+
+# Committed, for those who implement the format: `python docs/_ext/declared_schemas.py` writes them.
+OPEN = Path(__file__).parents[1] / "formats" / "schemas"
 
 
 def schemas() -> dict[str, dict[str, Any]]:
@@ -25,7 +32,7 @@ def schemas() -> dict[str, dict[str, Any]]:
         "manifest": _without_document(Manifest.model_json_schema()),
         "run": _without_document(RunRecord.model_json_schema()),
         "comparison": _without_document(ComparisonRecord.model_json_schema()),
-        **{name: of.model_json_schema() for name, of in RESULTS.items()},
+        **{name: of.model_json_schema() for name, of in RESULTS.items() if name != "case"},
     }
 
 
@@ -48,3 +55,18 @@ def _plan() -> dict[str, Any]:
         "properties": {"seed": {"type": "integer", "minimum": 0}} | tables,
         "additionalProperties": False,
     }
+
+
+def open_format() -> dict[str, str]:
+    """Return the schemas of a case, its answer and a diagnosis as text, by the names of files."""
+    kinds = {"case": CaseFile, "answer": Answer, "diagnosis": Scored}
+    draft = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
+    return {
+        f"{name}.json": json.dumps(draft | kind.model_json_schema(), indent=1) + "\n"
+        for name, kind in kinds.items()
+    }
+
+
+if __name__ == "__main__":
+    for file, text in open_format().items():
+        (OPEN / file).write_text(text, encoding="utf-8")

@@ -17,7 +17,7 @@ from calib.batch.folders import claimed, fresh_folder
 from calib.cli.app import app
 from calib.errors import CalibError
 from calib.models import example_csv
-from challenge.seal import KEY_SCHEMA, publish, seal
+from challenge.seal import write_case as hide
 from tests.gap.cases import PULL_ONLY, make_case, write_case
 
 PLAN = """
@@ -35,15 +35,15 @@ AT_ONCE = {
     "diagnose": "diagnose none --out OUT",
     "audit": "audit --out OUT",
     "predict": "predict none --at none.csv --out OUT",
-    "score": "challenge score none --results none --key none.json --out OUT",
+    "score": "challenge score none --results none --key none --out OUT",
 }
 # These read what they are to do first, and land one result after the other.
 LANDING = {
     "sbc": "sbc --model bekker --simulations 10 --workers 1 --out OUT",
     "campaign": "campaign plan.toml --workers 1 --out OUT",
     "run": "challenge run cases --workers 1 --out OUT",
-    "make": "challenge make --seed 1 --cases 1 --workers 1 --key key.json --out OUT",
-    "well-specified": "challenge well-specified cases --key sealed.json --out-key key.json "
+    "make": "challenge make --seed 1 --cases 1 --workers 1 --key answers --out OUT",
+    "well-specified": "challenge well-specified cases --key sealed --out-key answers "
     "--workers 1 --out OUT",
 }
 # These write at once.
@@ -65,8 +65,8 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         make_case("force_offset", models=PULL_ONLY, n_lab=15, n_field=12), cases / "case-000"
     )
     truth = {"tier": "easy", "truth": "force_offset", "gap_over_noise": 3.0}
-    key = {"schema": KEY_SCHEMA, "seed": 1, "salt": "", "cases": {"case-000": truth}}
-    publish(cases, key, seal(key, Path("sealed.json")), ("easy",))
+    files = {"case.toml": (cases / "case-000" / "case.toml").read_text(encoding="utf-8")}
+    hide(cases / "case-000", files, Path("sealed"), truth)
     return tmp_path
 
 
@@ -160,11 +160,11 @@ def test_a_full_disk_is_found_before_the_work_and_leaves_nothing(full: Path, no_
         assert {path.name for path in full.rglob("*") if path.is_file()} == {"photos"}, verb
 
 
-def test_a_key_that_cannot_be_written_is_found_before_cases_are_made(
+def test_answers_that_cannot_be_written_are_found_before_cases_are_made(
     read_only: Path, no_work: None
 ) -> None:
-    words = f"challenge make --seed 1 --cases 1 --out OUT --key {read_only / 'key.json'}"
-    assert "key.json: the output cannot be written" in refused(words, Path("new"))
+    words = f"challenge make --seed 1 --cases 1 --out OUT --key {read_only / 'answers'}"
+    assert "answers: the output cannot be written" in refused(words, Path("new"))
 
 
 def test_results_that_land_in_an_earlier_folder_are_refused_as_early(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import tomllib
 from collections import Counter
 from pathlib import Path
@@ -18,7 +17,7 @@ from challenge.design import NOISES, Noise
 from challenge.effects import LISTED
 from challenge.files import OUTPUT_COLUMNS
 from challenge.make import make, make_case, plan
-from challenge.seal import open_key, sha256
+from challenge.seal import sha256
 from tests.blind import BlindTest
 
 CONTRACT_COLUMNS = (
@@ -36,22 +35,20 @@ def table(path: Path) -> tuple[list[str], np.ndarray]:
 
 
 def each_case(blind_test: BlindTest) -> list[tuple[Path, dict[str, Any]]]:
-    """Return folders with their entries in the key."""
-    cases = open_key(blind_test.cases, blind_test.key)["cases"]
-    return [(blind_test.cases / name, entry) for name, entry in cases.items()]
+    """Return folders with their answers."""
+    return [(blind_test.cases / name, answer) for name, answer in blind_test.answers.items()]
 
 
 def test_folders_hold_exactly_the_contracts_files(blind_test: BlindTest) -> None:
-    assert sha256(blind_test.key.read_bytes()) == blind_test.digest
-    assert (blind_test.cases / "HASH").read_text(encoding="utf-8").strip() == blind_test.digest
-    manifest = json.loads((blind_test.cases / "manifest.json").read_text(encoding="utf-8"))
-    assert (manifest["key_sha256"], manifest["n_cases"]) == (blind_test.digest, 6)
-    assert "seed" not in manifest
-    names = sorted(path.name for path in blind_test.cases.iterdir())
-    assert names == ["HASH", *(f"case-{i:03d}" for i in range(6)), "manifest.json"]
+    names = [f"case-{i:03d}" for i in range(6)]
+    assert sorted(path.name for path in blind_test.cases.iterdir()) == names
+    assert sorted(path.name for path in blind_test.key.iterdir()) == names
     for folder, _ in each_case(blind_test):
         files = sorted(path.name for path in folder.iterdir())
         assert files == ["case.toml", "field.csv", "fresh.csv", "lab.csv"]
+        case = tomllib.loads((folder / "case.toml").read_text(encoding="utf-8"))
+        answer = blind_test.key / folder.name / "answer.json"
+        assert case["answer_sha256"] == sha256(answer.read_bytes())
 
 
 def test_tables_have_the_contracts_columns(blind_test: BlindTest) -> None:
@@ -109,9 +106,10 @@ def test_gaps_are_as_large_as_promised(blind_test: BlindTest) -> None:
 
 
 def test_no_case_gives_its_answer_away(blind_test: BlindTest) -> None:
-    key = open_key(blind_test.cases, blind_test.key)
-    words = {entry["truth"] for entry in key["cases"].values()} - {"none"}
-    words |= {entry["mechanism"] for entry in key["cases"].values()} | {key["salt"]}
+    answers = blind_test.answers.values()
+    assert len({answer["salt"] for answer in answers}) == len(answers)
+    words = {answer["truth"] for answer in answers} - {"none"}
+    words |= {answer[key] for answer in answers for key in ("mechanism", "salt")}
     for path in blind_test.cases.rglob("*"):
         if path.is_file():
             text = path.read_text(encoding="utf-8")
@@ -119,7 +117,7 @@ def test_no_case_gives_its_answer_away(blind_test: BlindTest) -> None:
 
 
 def test_nothing_is_its_own_rival(blind_test: BlindTest) -> None:
-    for case in open_key(blind_test.cases, blind_test.key)["cases"].values():
+    for case in blind_test.answers.values():
         if case["truth"] != "none":
             assert case["rival"] not in case["truth"].split("+")
             assert (case["rival"] == "") == (case["rival_nats"] is None)
@@ -127,19 +125,17 @@ def test_nothing_is_its_own_rival(blind_test: BlindTest) -> None:
 
 def test_same_seed_same_case() -> None:
     a, again, b = (make_case(np.random.SeedSequence(i), "hard", "none") for i in (1, 1, 2))
-    assert (a.files, a.key) == (again.files, again.key)
+    assert (a.files, a.answer) == (again.files, again.answer)
     assert a.files["lab.csv"] != b.files["lab.csv"]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
 def test_same_seed_same_bytes(blind_test: BlindTest, tmp_path: Path, workers: int) -> None:
-    again = make(tmp_path / "c", tmp_path / "key.json", seed=5, n_cases=6, workers=workers)
-    assert again == blind_test.digest
-    assert (tmp_path / "key.json").read_bytes() == blind_test.key.read_bytes()
-    for path in blind_test.cases.rglob("*"):
-        if path.is_file():
-            other = tmp_path / "c" / path.relative_to(blind_test.cases)
+    make(tmp_path / "cases", tmp_path / "sealed", seed=5, n_cases=6, workers=workers)
+    for root in (blind_test.cases, blind_test.key):
+        for path in filter(Path.is_file, root.rglob("*")):
+            other = tmp_path / root.name / path.relative_to(root)
             assert other.read_bytes() == path.read_bytes()
 
 
@@ -164,9 +160,9 @@ def test_large_gaps_have_no_nulls_and_up_to_three_causes() -> None:
     assert {name.count("+") for name in truths} == {0, 1, 2}
 
 
-def test_the_key_says_what_each_of_several_causes_adds() -> None:
+def test_the_answer_says_what_each_of_several_causes_adds() -> None:
     truth = "force_offset+lug_thrust+sensor_drift"
-    made = make_case(np.random.SeedSequence([5, 1]), "large", truth).key
+    made = make_case(np.random.SeedSequence([5, 1]), "large", truth).answer
     assert made["gap_over_noise"] >= 5.0
     assert sorted(made["contributions"]) == sorted(made["truth"].split("+"))
     assert min(made["contributions"].values()) >= 1.0
@@ -185,20 +181,19 @@ def test_every_noise_has_its_sd_and_nothing_else_is_the_same(kind: str) -> None:
     assert noise.step(sd) == (0.6 if kind == "rounded" else 0.0)
 
 
-def test_key_is_never_among_the_cases(tmp_path: Path) -> None:
+def test_answers_are_never_among_the_cases(tmp_path: Path) -> None:
     with pytest.raises(CalibError, match="must not lie with the cases"):
-        make(tmp_path / "c", tmp_path / "c" / "key.json", seed=1, n_cases=1)
+        make(tmp_path / "c", tmp_path / "c" / "key", seed=1, n_cases=1)
     (tmp_path / "old").mkdir()
     (tmp_path / "old" / "x").write_text("x", encoding="utf-8")
     with pytest.raises(CalibError, match="not empty"):
-        make(tmp_path / "old", tmp_path / "key.json", seed=1, n_cases=1)
+        make(tmp_path / "old", tmp_path / "key", seed=1, n_cases=1)
     for n_cases, tiers in ((0, ("easy",)), (1, ("middling",)), (1, ())):
         with pytest.raises(CalibError):
             make(tmp_path / "c", tmp_path / "k", seed=1, n_cases=n_cases, tiers=tiers)  # type: ignore[arg-type]
         assert not (tmp_path / "c").exists()
-    (tmp_path / "key.json").write_text("{}", encoding="utf-8")
-    with pytest.raises(CalibError, match="a key is there already"):
-        make(tmp_path / "new", tmp_path / "key.json", seed=1, n_cases=1)
+    with pytest.raises(CalibError, match="not empty"):
+        make(tmp_path / "new", tmp_path / "old", seed=1, n_cases=1)
 
 
 def test_drawn_lab_is_described_by_the_cases_models() -> None:

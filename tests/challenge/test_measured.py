@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import tomllib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
 from calib.gap.case import read_case
 from calib.gap.constants import MIN_FIELD_ROWS
@@ -22,11 +20,11 @@ from calib.gap.effects.base import View
 from calib.inference.problem import build_problem
 from calib.models import MODELS
 from calib.models.magic_formula import magic_formula
-from calib.models.simulators.files import load_files
+from challenge.answers import FAILED, read_answer
 from challenge.measured.__main__ import run
-from challenge.measured.cases import HERE, NONE, SIMULATORS, UNLISTED, MeasuredCase, read_cases
-from challenge.measured.marks import FAILED, mark, markdown
-from tests.registered import forgotten
+from challenge.measured.cases import HERE, NONE, UNLISTED, MeasuredCase, read_cases
+from challenge.measured.marks import documented, markdown, wrong
+from challenge.seal import open_answers
 
 CASES = read_cases()
 REPORT = (Path(__file__).parents[2] / "reports" / "measured.md").read_text(encoding="utf-8")
@@ -40,19 +38,11 @@ def named(name: str) -> MeasuredCase:
     return next(c for c in CASES if c.name == name)
 
 
-@pytest.fixture(scope="module")
-def simulators() -> Iterator[None]:
-    """Register the bench's own simulators, and take them back."""
-    with forgotten(QUANTITIES, MODELS, EFFECTS):
-        load_files(SIMULATORS)
-        yield
-
-
 @pytest.mark.parametrize("case", CASES, ids=lambda c: c.name)
 def test_a_case_can_be_calibrated_and_predicted(
     case: MeasuredCase, tmp_path: Path, simulators: None
 ) -> None:
-    case.write(tmp_path / "case")
+    case.write(tmp_path / "case", tmp_path / "answers")
     read = read_case(tmp_path / "case")
     lab, field = read.lab, read.field
     assert len(field) >= MIN_FIELD_ROWS
@@ -83,7 +73,7 @@ def test_the_tyre_s_curve_is_the_magic_formula_over_the_load(simulators: None) -
 
 
 def test_written_cases_hold_no_answer(tmp_path: Path) -> None:
-    named("hit_lugs").write(tmp_path / "case")
+    named("hit_lugs").write(tmp_path / "case", tmp_path / "answers")
     text = "".join(p.read_text(encoding="utf-8") for p in (tmp_path / "case").iterdir())
     assert "lug" not in text
     assert "rut_depth" not in text
@@ -174,24 +164,28 @@ def test_marks_are_those_of_a_hand(tmp_path: Path) -> None:
     diagnoses = {
         "hit_lugs": said({"lug_thrust": 0.7, "force_offset": 0.95}, 0.2, "effect"),
         "cmu_side_15": said({"lug_thrust": 0.3}, 0.6, "unknown"),
-        "cmu_plate_size": said({"depends_on_plate_width": 0.4, "parameter_shift": 0.6}, 0, "x"),
+        "cmu_plate_size": said(
+            {"depends_on_plate_width": 0.4, "parameter_shift": 0.6}, 0, "effect"
+        ),
         "trec_null": said({"force_offset": 0.5}, 0.1, "ambiguous"),
         "kls_null_plate": None,
     }
     marks = []
     for name, diagnosis in diagnoses.items():
-        folder = tmp_path / name
-        folder.mkdir()
+        folder = tmp_path / "results" / name
+        folder.mkdir(parents=True)
         if diagnosis:
             (folder / "diagnosis.json").write_text(json.dumps(diagnosis))
-        marks.append(mark(named(name), folder))
+        named(name).write(tmp_path / "cases" / name, tmp_path / "answers")
+        answers = open_answers(tmp_path / "cases", tmp_path / "answers")
+        marks.append(read_answer(name, answers[name], folder))
     right, unlisted, size, alarm, failed = marks
-    assert (right.cause, unlisted.cause, size.cause) == (0.7, 0.6, 0.4)
-    assert right.wrong(0.9) == (("force_offset", 0.95),)
-    assert unlisted.wrong(0.5) == size.wrong(0.5) == ()  # parameter_shift is defensible there
-    assert alarm.wrong(0.5) == (("force_offset", 0.5),)
+    assert [documented(a) for a in (right, unlisted, size)] == [0.7, 0.6, 0.4]
+    assert [(c.name, c.probability) for c in wrong(right, 0.9)] == [("force_offset", 0.95)]
+    assert wrong(unlisted, 0.5) == wrong(size, 0.5) == []  # parameter_shift is defensible there
+    assert [c.name for c in wrong(alarm, 0.5)] == ["force_offset"]
     assert failed.verdict == FAILED
-    lines = markdown(marks).splitlines()
+    lines = markdown(marks, [named(name) for name in diagnoses]).splitlines()
     assert [line.split("|")[2].strip() for line in lines[2:6]] == ["2/3", "2/5", "1/5", "2/2"]
     row = "| cmu_side_15 | unlisted | 3.4 | unknown, some | 0.60 | lug_thrust 0.30 (1) | 0.60 |"
     assert row in lines

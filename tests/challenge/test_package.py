@@ -9,13 +9,10 @@ from pathlib import Path
 import pytest
 
 import challenge
-from calib.batch.campaign.kinds import ChallengeSection
-from challenge.make import NULL_FRACTION
 from challenge.measured.cases import SIMULATORS
 from tests.commands import Calib
 
 ROOT = Path(challenge.__path__[0]).parent
-PLAN = '[[challenge]]\nname = "blind"\ncases = 1\ndraw_seed = 5\n'
 
 
 @pytest.fixture
@@ -30,22 +27,21 @@ def no_bench(monkeypatch: pytest.MonkeyPatch) -> None:
     [
         ("challenge", "make", "--out", "cases", "--key", "key", "--seed", "1"),
         ("challenge", "score", "cases", "--results", "results", "--key", "key"),
-        ("campaign", "plan.toml"),
+        ("challenge", "run", "cases", "--out", "results", "--program", "rival {case} {out}"),
     ],
 )
 @pytest.mark.usefixtures("no_bench")
 def test_without_the_bench_it_is_named_and_nothing_is_written(
     words: tuple[str, ...], tmp_path: Path, run: Calib
 ) -> None:
-    (tmp_path / "plan.toml").write_text(PLAN, encoding="utf-8")
+    (tmp_path / "cases" / "one").mkdir(parents=True)
+    (tmp_path / "cases" / "one" / "case.toml").touch()
     ran = run(*words)
     assert ran.code == 2
     assert "a test bench of the repository, not of the wheel" in ran.err
     assert "hint: run from a checkout" in ran.err
-    assert ("[[challenge]]" if words[0] == "campaign" else f"calib {words[0]} {words[1]}") in (
-        ran.err
-    )
-    assert [p.name for p in tmp_path.iterdir()] == ["plan.toml"]
+    assert f"calib {words[0]} {words[1]}" in ran.err
+    assert [p.name for p in tmp_path.iterdir()] == ["cases"]
 
 
 def test_the_wheel_is_calib_alone_and_the_sdist_has_the_bench() -> None:
@@ -54,8 +50,6 @@ def test_the_wheel_is_calib_alone_and_the_sdist_has_the_bench() -> None:
     assert targets["wheel"]["packages"] == ["calib"]
     assert set(targets["wheel"]["force-include"]) == {"priors"}
     assert "challenge" in targets["sdist"]["include"]
-    # The plan's default is the bench's, which a plan without challenge cases does not import.
-    assert ChallengeSection.model_fields["null_fraction"].default == NULL_FRACTION
     # Simulators that it hands to the program are read by that, as a user's are.
     files = set(Path(challenge.__path__[0]).rglob("*.py")) - set(SIMULATORS)
-    assert sum(len(file.read_text(encoding="utf-8").splitlines()) for file in files) <= 5000
+    assert sum(len(file.read_text(encoding="utf-8").splitlines()) for file in files) <= 5500

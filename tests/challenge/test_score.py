@@ -20,12 +20,13 @@ from calib.gap.batch import INPUTS, case_hashes
 from challenge.answers import CaseAnswer, CauseAnswer, _ranked, auc, read_answer
 from challenge.figures import levels_figure, reliability_figure
 from challenge.files import OUTPUT_COLUMNS
+from challenge.format import Answer, Explanation
 from challenge.levels import LEVELS
 from challenge.score import Proportion, score, score_tier
-from challenge.seal import KEY_SCHEMA, open_key, publish, seal
+from challenge.seal import open_answers, write_case
 from challenge.table import text_table
 
-Answer = Callable[[dict[str, Any]], dict[str, Any]]
+Writer = Callable[[dict[str, Any]], dict[str, Any]]
 TRUTHS = ("none", "none", "unknown", "rate_effect", "force_offset+rate_effect", "parameter_shift")
 
 
@@ -44,18 +45,28 @@ def entry(truth: str, tier: str) -> dict[str, Any]:
     }
 
 
+def hidden(folder: Path, cases: dict[str, dict[str, Any]]) -> tuple[Path, Path]:
+    """Write cases with their answers, and return both folders."""
+    for name, answer in cases.items():
+        files = {"case.toml": "", "lab.csv": f"lab of {name}", "field.csv": f"field of {name}"}
+        write_case(folder / "cases" / name, files, folder / "answers", answer)
+    return folder / "cases", folder / "answers"
+
+
+def truths(answers: Path) -> dict[str, dict[str, Any]]:
+    """Return the answers by case."""
+    found = sorted(answers.glob("*/answer.json"))
+    return {path.parent.name: json.loads(path.read_text(encoding="utf-8")) for path in found}
+
+
 @pytest.fixture
 def sealed(tmp_path: Path) -> tuple[Path, Path]:
-    """Return cases' folder and key of a test with six cases per tier."""
+    """Return the folders of cases and answers of a test with six cases per tier."""
     cases = {
         f"case-{i:03d}": entry(truth, tier)
         for i, (tier, truth) in enumerate((t, n) for t in ("easy", "hard") for n in TRUTHS)
     }
-    key = {"schema": KEY_SCHEMA, "seed": 1, "salt": "ab", "cases": cases}
-    (tmp_path / "cases").mkdir()
-    digest = seal(key, tmp_path / "key.json")
-    publish(tmp_path / "cases", key, digest, ("easy", "hard"))
-    return tmp_path / "cases", tmp_path / "key.json"
+    return hidden(tmp_path, cases)
 
 
 def perfect(case: dict[str, Any]) -> dict[str, Any]:
@@ -91,9 +102,9 @@ def worst(case: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def write(results: Path, key: Path, answer: Answer, skip: tuple[str, ...] = ()) -> None:
+def write(results: Path, key: Path, answer: Writer, skip: tuple[str, ...] = ()) -> None:
     """Write diagnoses and predictions of every case but some."""
-    for name, case in json.loads(key.read_text(encoding="utf-8"))["cases"].items():
+    for name, case in truths(key).items():
         if name in skip:
             continue
         given = answer(case)
@@ -171,33 +182,41 @@ def test_names_of_a_pair_count_in_any_order(sealed: tuple[Path, Path], tmp_path:
     assert score(sealed[0], tmp_path / "b", sealed[1]).tiers["hard"].top_1 == Proportion(3, 4)
 
 
-def test_changed_key_is_refused(sealed: tuple[Path, Path], tmp_path: Path) -> None:
-    cases, key = sealed
-    text = key.read_text(encoding="utf-8")
-    key.write_text(text.replace("rate_effect", "lug_thrust"), encoding="utf-8")
+def test_changed_answer_is_refused(sealed: tuple[Path, Path], tmp_path: Path) -> None:
+    cases, answers = sealed
+    path = answers / "case-003" / "answer.json"
+    text = path.read_text(encoding="utf-8")
+    path.write_text(text.replace("rate_effect", "lug_thrust"), encoding="utf-8")
     with pytest.raises(CalibError, match="SHA-256"):
-        score(cases, tmp_path, key)
-    with pytest.raises(CalibError, match="cannot be read"):
-        score(cases, tmp_path, tmp_path / "nowhere.json")
-    key.write_text(text, encoding="utf-8")
-    assert open_key(cases, key)["salt"] == "ab"
+        score(cases, tmp_path, answers)
+    with pytest.raises(CalibError, match="there are no answers"):
+        score(cases, tmp_path, tmp_path / "nowhere")
+    path.write_text(text, encoding="utf-8")
+    assert open_answers(cases, answers)["case-003"].truth == "rate_effect"
     with pytest.raises(CalibError, match="there is no diagnosis"):
-        score(cases, tmp_path / "nowhere", key)
-    (cases / "manifest.json").unlink()
-    with pytest.raises(CalibError, match="published"):
-        score(cases, tmp_path, key)
+        score(cases, tmp_path / "nowhere", answers)
+    (cases / "case-003" / "case.toml").write_text("", encoding="utf-8")
+    with pytest.raises(CalibError, match="published answer_sha256, None"):
+        score(cases, tmp_path, answers)
+
+
+def test_a_case_without_its_answer_is_told(sealed: tuple[Path, Path], tmp_path: Path) -> None:
+    cases, answers = sealed
+    write(tmp_path / "r", answers, perfect)
+    (answers / "case-003" / "answer.json").unlink()
+    found = score(cases, tmp_path / "r", answers)
+    assert len(found.answers) == 11
+    assert "1 cases have no answer and are not scored, one is case-003" in found.warnings
 
 
 def test_diagnoses_of_other_cases_are_refused(sealed: tuple[Path, Path], tmp_path: Path) -> None:
     cases, key = sealed
     write(tmp_path / "r", key, perfect)
     assert "12 of 12 diagnoses cannot be held" in score(cases, tmp_path / "r", key).warnings[0]
-    for name in json.loads(key.read_text(encoding="utf-8"))["cases"]:
-        (cases / name).mkdir()
+    for name in truths(key):
+        path = cases / name / "case.toml"
         text = 'calibration = "lab.csv"\nfield = "field.csv"\n[models]\ndrawbar_pull = "m"\n'
-        (cases / name / "case.toml").write_text(text, encoding="utf-8")
-        for file in ("lab.csv", "field.csv"):
-            (cases / name / file).write_text(f"{file} of {name}", encoding="utf-8")
+        path.write_text(path.read_text(encoding="utf-8") + text, encoding="utf-8")
         record = json.dumps(case_hashes(cases / name))
         (tmp_path / "r" / name / INPUTS).write_text(record, encoding="utf-8")
     assert score(cases, tmp_path / "r", key).warnings == ()
@@ -257,15 +276,13 @@ def test_cases_of_some_outputs_are_scored_alone(tmp_path: Path) -> None:
         if i >= len(TRUTHS):
             for name in ("noise_sd", "field_truth", "field_without", "fresh_truth"):
                 case[name]["rut_depth"] = [1.0] * 10
-    (tmp_path / "cases").mkdir()
-    key = {"schema": KEY_SCHEMA, "seed": 1, "salt": "ab", "cases": cases}
-    publish(tmp_path / "cases", key, seal(key, tmp_path / "key.json"), ("easy",))
+    hidden(tmp_path, cases)
 
     def answer(case: dict[str, Any]) -> dict[str, Any]:
         return perfect(case) if "rut_depth" in case["noise_sd"] else worst(case)
 
-    write(tmp_path / "r", tmp_path / "key.json", answer)
-    where = tmp_path / "cases", tmp_path / "r", tmp_path / "key.json"
+    write(tmp_path / "r", tmp_path / "answers", answer)
+    where = tmp_path / "cases", tmp_path / "r", tmp_path / "answers"
     assert score(*where).tiers["easy"].top_1 == Proportion(4, 8)
     alone = score(*where, ["rut_depth", "drawbar_pull"])
     assert alone.tiers["easy"].top_1 == Proportion(4, 4)
@@ -354,7 +371,8 @@ def test_what_stated_probabilities_promise_is_what_comes_true_if_they_are_right(
 
 
 def told_apart(tmp_path: Path, truth: str, **rival: Any) -> float | None:
-    return read_answer("case-000", entry(truth, "easy") | rival, tmp_path).told_apart
+    content = {"schema": "calib/answer/1", **entry(truth, "easy"), **rival}
+    return read_answer("case-000", Answer.model_validate(content), tmp_path).told_apart
 
 
 def test_a_nearest_rival_is_the_chance_to_choose_the_truth(tmp_path: Path) -> None:
@@ -372,8 +390,7 @@ def test_a_nearest_rival_is_the_chance_to_choose_the_truth(tmp_path: Path) -> No
 
 def test_listed_causes_with_something_unlisted_besides_are_those_causes():
     said = {"lug_thrust+unknown": 0.4, "lug_thrust": 0.3, "b+a": 0.1, "unknown": 0.2}
-    effects = [{"name": name, "probability": p} for name, p in said.items()]
-    ranked = _ranked({"effects": effects})
+    ranked = _ranked([Explanation(name=name, probability=p) for name, p in said.items()])
     assert dict(ranked) == pytest.approx({"lug_thrust": 0.7, "unknown": 0.2, "a+b": 0.1})
     assert ranked[0][0] == "lug_thrust"
 

@@ -24,7 +24,7 @@ from calib.cli import main
 main()
 """
 RANKS = '[[sbc]]\nname = "ranks"\nsimulations = 400\ndraw_seed = 3\nmodels = ["bekker"]\n'
-CASES = '[[challenge]]\nname = "blind"\ncases = {}\ndraw_seed = 5\ntier = "easy"\n'
+RANKS = '[[sbc]]\nname = "r"\nsimulations = {}\ndraw_seed = 5\nmodels = ["bekker"]\n'
 FIT = '[[fit]]\nname = "a"\ndata = ["*.csv"]\nmodels = ["bekker"]\nposteriors = false\n'
 
 
@@ -45,15 +45,15 @@ def test_it_works_and_goes_on_where_it_stopped(campaign: Calib) -> None:
     assert (ran.code, ran.out) == (0, "1 of 1 tasks done, 0 failed\nout/summary.json\n")
     numbers = Path("out/results/a.rut.bekker.shipped.nothing/numbers.json")
     first = numbers.stat().st_mtime_ns
-    ran = campaign(FIT + CASES.format(1))
+    ran = campaign(FIT + RANKS.format(1))
     assert (ran.code, ran.out.splitlines()[0]) == (0, "2 of 2 tasks done, 0 failed")
     assert numbers.stat().st_mtime_ns == first
 
 
 def test_a_list_of_tasks_does_nothing(campaign: Calib) -> None:
-    ran = campaign(FIT + CASES.format(2), "--list")
+    ran = campaign(FIT + RANKS.format(2), "--list")
     assert ran.code == 0
-    assert ran.out == "a.rut.bekker.shipped.nothing\nblind.case-000\nblind.case-001\n"
+    assert ran.out == "a.rut.bekker.shipped.nothing\nr.bekker-0000\nr.bekker-0001\n"
     assert not Path("out").exists()
 
 

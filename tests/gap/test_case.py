@@ -83,7 +83,7 @@ def test_units_in_column_names_are_converted(tmp_path):
             'calibration = "lab.csv"\nfield = "field.csv"\nprdict = "fresh.csv"\n[models]\n'
             'rut_depth = "bekker"\n',
             "unknown key prdict\n  expected: calibration, field, predict, models, priors, "
-            "covariates, context\n"
+            "covariates, context, simulations, answer_sha256\n"
             "  hint: did you mean predict?",
         ),
         (

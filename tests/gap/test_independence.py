@@ -121,7 +121,7 @@ def test_a_case_of_the_challenge_is_diagnosed(tmp_path):
     from calib.gap.effects import EFFECTS
     from challenge.make import make
 
-    make(tmp_path / "cases", tmp_path / "key.json", seed=3, n_cases=1)
+    make(tmp_path / "cases", tmp_path / "answers", seed=3, n_cases=1)
     (folder,) = [p for p in (tmp_path / "cases").iterdir() if (p / "case.toml").exists()]
     found = diagnose(read_case(folder), effects={"force_offset": EFFECTS["force_offset"]})
     assert found.verdict in ("effect", "none", "unknown", "ambiguous")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import tomllib
 from functools import partial
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from calib.gap.well_specified import SIZE_RATIO, draw_from_hypothesis, well_spec
 from challenge.files import OUTPUT_COLUMNS
 from challenge.redraw import redraw
 from challenge.score import score
-from challenge.seal import open_key
+from challenge.seal import open_answers
 from tests.gap.cases import campaigns_of, make_case, write_case
 
 
@@ -34,9 +35,13 @@ def believed(believed_test) -> tuple[Path, Path]:
     return believed_test.cases, believed_test.key
 
 
+def answers(cases: Path, folder: Path) -> dict[str, dict]:
+    return {name: a.model_dump() for name, a in open_answers(cases, folder).items()}
+
+
 def drawn(blind: tuple[Path, Path], root: Path, **options: int) -> dict[str, str]:
     draw = partial(well_specified_case, 1)
-    return redraw(*blind, root / "cases", root / "key.json", draw, seed=1, **options)
+    return redraw(*blind, root / "cases", root / "answers", draw, seed=1, **options)
 
 
 def cells(path: Path) -> list[dict[str, str]]:
@@ -45,12 +50,16 @@ def cells(path: Path) -> list[dict[str, str]]:
 
 
 def test_design_and_kind_are_those_of_the_case(blind, believed):
-    cases, theirs = (open_key(*pair)["cases"] for pair in (blind, believed))
+    cases, theirs = (answers(*pair) for pair in (blind, believed))
     assert list(theirs) == list(cases)
     for name, entry in theirs.items():
         assert (entry["tier"], entry["truth"]) == (cases[name]["tier"], cases[name]["truth"])
-        for file in ("case.toml", "fresh.csv"):
-            assert (blind[0] / name / file).read_text() == (believed[0] / name / file).read_text()
+        both = [root / name / "case.toml" for root in (blind[0], believed[0])]
+        said = [tomllib.loads(path.read_text()) for path in both]
+        assert said[0].pop("answer_sha256") != said[1].pop("answer_sha256")
+        assert said[0] == said[1]
+        both = [path.with_name("fresh.csv").read_text() for path in both]
+        assert both[0] == both[1]
         for file in ("lab.csv", "field.csv"):
             ours, others = cells(believed[0] / name / file), cells(blind[0] / name / file)
             assert list(ours[0]) == list(others[0])
@@ -61,7 +70,7 @@ def test_design_and_kind_are_those_of_the_case(blind, believed):
 
 
 def test_the_gap_has_the_size_of_the_cases(blind, believed):
-    cases, theirs = (open_key(*pair)["cases"] for pair in (blind, believed))
+    cases, theirs = (answers(*pair) for pair in (blind, believed))
     for name, entry in theirs.items():
         squares = []
         for output, sd in entry["noise_sd"].items():
@@ -79,7 +88,7 @@ def test_the_gap_has_the_size_of_the_cases(blind, believed):
 def test_readings_are_the_truth_with_noise(believed):
     """Standardised differences have unit variance over all readings of all cases."""
     z = []
-    for name, entry in open_key(*believed)["cases"].items():
+    for name, entry in answers(*believed).items():
         rows = cells(believed[0] / name / "field.csv")
         for output, sd in entry["noise_sd"].items():
             read = np.array([float(row[OUTPUT_COLUMNS[output]]) for row in rows])
@@ -94,11 +103,9 @@ def test_readings_are_the_truth_with_noise(believed):
 @pytest.mark.slow  # with one, the command line's are compared in every run
 def test_the_same_seed_gives_the_same_cases_on_any_number_of_workers(blind, believed, tmp_path):
     drawn(blind, tmp_path, workers=2)
-    assert (tmp_path / "key.json").read_bytes() == believed[1].read_bytes()
-    for path in believed[0].rglob("*.csv"):
-        assert (
-            tmp_path / "cases" / path.relative_to(believed[0])
-        ).read_bytes() == path.read_bytes()
+    for root in believed:
+        for path in filter(Path.is_file, root.rglob("*")):
+            assert (tmp_path / root.name / path.relative_to(root)).read_bytes() == path.read_bytes()
 
 
 def test_they_are_diagnosed_and_scored_as_any_case(believed, tmp_path):
@@ -110,8 +117,10 @@ def test_they_are_diagnosed_and_scored_as_any_case(believed, tmp_path):
 
 
 def test_a_key_of_other_cases_is_refused(blind, tmp_path):
-    wrong = tmp_path / "key.json"
-    wrong.write_text(json.dumps({"schema": "calib/challenge-key/1", "cases": {}}))
+    wrong = tmp_path / "answers"
+    (wrong / "case-000").mkdir(parents=True)
+    answer = json.dumps({"schema": "calib/answer/1", "truth": "none"})
+    (wrong / "case-000" / "answer.json").write_text(answer)
     with pytest.raises(CalibError, match="SHA-256"):
         drawn((blind[0], wrong), tmp_path / "out")
     assert not (tmp_path / "out").exists()
@@ -130,11 +139,11 @@ def test_cases_that_cannot_be_drawn_are_named_and_a_key_is_not_overwritten(blind
             raise CalibError(f"not {truth}")
         return {"case.toml": ""}, {"gap_over_noise": size}
 
-    truths = {name: e["truth"] for name, e in open_key(*blind)["cases"].items()}
-    without = redraw(*blind, tmp_path / "cases", tmp_path / "key.json", refuse, seed=1)
+    truths = {name: e["truth"] for name, e in answers(*blind).items()}
+    without = redraw(*blind, tmp_path / "cases", tmp_path / "answers", refuse, seed=1)
     assert without == {name: f"not {truth}" for name, truth in truths.items() if truth != "none"}
-    with pytest.raises(CalibError, match="a key is there already"):
-        redraw(*blind, tmp_path / "more", tmp_path / "key.json", refuse, seed=1)
+    with pytest.raises(CalibError, match="not empty"):
+        redraw(*blind, tmp_path / "more", tmp_path / "answers", refuse, seed=1)
 
 
 LAB = {"drawbar_pull": Noise(0.03, 1.0), "rut_depth": Noise(0.05)}

@@ -114,14 +114,14 @@ _SCRATCH = tempfile.TemporaryDirectory(prefix="golden-")
 def _measured() -> Path:
     folder = Path(_SCRATCH.name) / "measured"
     for case in read_cases():
-        case.write(folder / case.name)
+        case.write(folder / case.name, folder.with_name("answers"))
     return folder
 
 
 @cache
 def _bench() -> Path:
     folder = Path(_SCRATCH.name) / "bench"
-    make(folder, Path(_SCRATCH.name) / "sealed" / "key.json", seed=_SEED, n_cases=8)
+    make(folder, Path(_SCRATCH.name) / "sealed", seed=_SEED, n_cases=8)
     return folder
 
 

@@ -1,8 +1,8 @@
 """The kinds of task a plan may ask for, by the names of their tables.
 
-A kind is a table of the plan, the tasks it stands for, and their work: fits, diagnoses, challenge
-cases (made by the repository's test bench, which a wheel does not have) and replicates of
-simulation-based calibration. Another kind is a table, three functions and a line at the end.
+A kind is a table of the plan, the tasks it stands for, and their work: fits, diagnoses and
+replicates of simulation-based calibration. Another kind is a table, three functions and a line at
+the end.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from itertools import product
 from math import isfinite
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from pydantic import Field
@@ -33,7 +33,6 @@ from calib.batch.campaign.kind import (
     simulators_of,
     word,
 )
-from calib.batch.environment import from_the_bench, source_sha256
 from calib.data import Table
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
@@ -396,98 +395,8 @@ def _sbc(item: Item, seed: int) -> Work:
     return numbers, {"replicate.json": json.dumps(record, indent=1) + "\n"}
 
 
-# Challenge cases
-
-
-class ChallengeSection(Section):
-    """``[[challenge]]``: cases drawn from a seed."""
-
-    cases: int = Field(ge=1, description="how many, 1 or more")
-    draw_seed: int = Field(ge=0, description="0 or a positive whole number: which cases are drawn")
-    tier: Literal["both", "easy", "hard"] = Field(
-        default="both", description="'easy', 'hard' or 'both'"
-    )
-    null_fraction: float = Field(
-        default=1.0 / 3.0, ge=0.0, le=0.7, description="the share without a gap, 0 to 0.7"
-    )
-
-
-# A case's seed, tier and truth, and the hash of the code that makes it.
-type ChallengeItem = tuple[np.random.SeedSequence, Literal["easy", "hard"], str, str]
-
-
-def _plan_challenge(section: ChallengeSection, place: Place) -> Iterator[Planned]:
-    """Yield a task for each case."""
-    with from_the_bench(place.where):
-        from challenge.make import case_jobs
-
-    tiers: tuple[Any, ...] = ("easy", "hard") if section.tier == "both" else (section.tier,)
-    jobs, _ = case_jobs(section.draw_seed, section.cases, tiers, section.null_fraction)
-    for name, (own, tier, truth) in jobs.items():
-        settings = {
-            "draw_seed": section.draw_seed, "spawn_key": list(own.spawn_key), "tier": tier,
-            "truth": truth, "bench": _bench(),
-        }  # fmt: skip
-        yield name, settings, {}
-
-
-def _load_challenge(task: Task) -> ChallengeItem:
-    s = task.settings
-    own = np.random.SeedSequence(s["draw_seed"], spawn_key=tuple(s["spawn_key"]))
-    return own, s["tier"], s["truth"], s["bench"]
-
-
-def _challenge(item: ChallengeItem, seed: int) -> Work:
-    """Make a case, diagnose its files, and mark the diagnosis with its key.
-
-    The cases are those of `calib challenge make --seed DRAW_SEED`, but their answers lie beside
-    the diagnoses: this is for figures over many cases, not for a test that others should believe.
-    """
-    with from_the_bench("[[challenge]]"):
-        from challenge.answers import read_answer
-        from challenge.make import make_case
-
-    own, tier, truth, bench = item
-    if _bench() != bench:
-        raise CalibError(
-            "this worker would make other cases",
-            where="[[challenge]]",
-            expected=f"the folder `challenge` whose hash is {bench}",
-            hint="give the worker the same checkout",
-        )
-    made = make_case(own, tier, truth)
-    with TemporaryDirectory() as scratch:
-        folder = Path(scratch) / "case"
-        made.write(folder)
-        found = diagnose(read_case(folder), seed)
-        files = written(found)
-        for name in ("diagnosis.json", "fresh_prediction.csv"):
-            (folder / name).write_bytes(files[name])
-        answer = read_answer("case", made.key, folder)
-    numbers = {
-        "tier": answer.tier,
-        "truth": answer.truth,
-        "truth_probability": answer.truth_probability,
-        "right_first": answer.among_first(1),
-        "right_first_two": answer.among_first(2),
-        "localisation_auc": answer.auc,
-        "gap_over_noise": made.key["gap_over_noise"],
-        "actual_shrink": {s.output: s.actual for s in answer.shrinks},
-        "shrink_covered": {s.output: s.covered for s in answer.shrinks},
-    }
-    return numbers | diagnosis_numbers(found), files
-
-
-def _bench() -> str:
-    """Return the hash of the bench's code here."""
-    import challenge
-
-    return source_sha256(Path(challenge.__path__[0]))[:12]
-
-
 KINDS: Mapping[str, Kind] = {
     "fit": Kind(FitSection, _plan_fits, _load_fit, _fit),
     "diagnose": Kind(DiagnoseSection, _plan_diagnoses, _load_diagnosis, _diagnose),
-    "challenge": Kind(ChallengeSection, _plan_challenge, _load_challenge, _challenge),
     "sbc": Kind(SbcSection, _plan_sbc, _load_sbc, _sbc),
 }

@@ -26,12 +26,6 @@ models = ["bekker"]
 name = "sites"
 cases = ["cases/*"]
 
-[[challenge]]
-name = "blind"
-cases = 1
-draw_seed = 5
-tier = "easy"
-
 [[sbc]]
 name = "ranks"
 simulations = 2
@@ -41,7 +35,6 @@ models = ["bekker"]
 NAMES = (
     "ruts.data-rut.bekker.shipped.nothing",
     *(f"sites.cases-case-{i}" for i in range(N_CASES)),
-    "blind.case-000",
     *(f"ranks.bekker-000{i}" for i in range(2)),
 )
 

@@ -32,7 +32,6 @@ from calib.models.simulators.emulator import emulator_of, load_emulator
 from calib.models.simulators.files import register_file
 from calib.validation.replicate import Item, replicate
 from calib.validation.sbc import SETTINGS
-from challenge.make import make
 from tests.batch.campaign.sites import EFFECT, NAMES, WIND, content, refuse_all
 from tests.models.simulators.examples import lab, pull, write_program
 
@@ -45,29 +44,6 @@ def test_a_diagnosis_is_that_of_the_verb(site, serial, tmp_path):
     found = content(serial / "results" / name)
     assert {k: found[k] for k in expected} == expected
     assert set(found) - set(expected) == {"numbers.json", "task.json"}
-
-
-def test_a_challenge_case_is_that_of_the_verb(site, serial, tmp_path):
-    make(tmp_path / "cases", tmp_path / "key", seed=5, n_cases=1, tiers=("easy",))
-    case = serial / "results" / "blind.case-000" / "case"
-    seed = read_plan(site).tasks["blind.case-000"].seed
-    diagnose_cases([tmp_path / "cases" / "case-000"], tmp_path / "out", seed)
-    expected = content(tmp_path / "out" / "case-000")
-    found = content(case.parent)
-    # The campaign knows the case by its task, the verb by its folder.
-    named = expected["document.json"].replace(b'"name":"case-000"', b'"name":"case"', 1)
-    expected["document.json"] = named
-    assert {k: found[k] for k in expected} == expected
-    truth = json.loads((tmp_path / "key").read_text())["cases"]["case-000"]["truth"]
-    numbers = json.loads((case.parent / "numbers.json").read_text())
-    assert numbers["truth"] == truth
-    assert numbers["right_first"] == (numbers["first"] == truth)
-    probability = {
-        e["name"]: e["probability"] for e in json.loads(found["diagnosis.json"])["effects"]
-    }
-    # With or without something unlisted besides.
-    told = sum(p for name, p in probability.items() if name.removesuffix("+unknown") == truth)
-    assert numbers["truth_probability"] == pytest.approx(told)
 
 
 def test_a_replicate_is_that_of_the_verb(serial):

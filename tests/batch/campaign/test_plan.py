@@ -44,7 +44,7 @@ def test_a_plan_is_its_tasks_by_name(site):
 
 
 def test_a_tasks_seed_is_its_own(folder):
-    one = '[[challenge]]\nname = "{}"\ncases = 2\ndraw_seed = 5\n'
+    one = '[[sbc]]\nname = "{}"\nsimulations = 2\ndraw_seed = 5\nmodels = ["bekker"]\n'
     seeds = {}
     for text in ("", "seed = 8\n"):
         planned(folder, text + one.format("a") + one.format("b"))
@@ -53,8 +53,8 @@ def test_a_tasks_seed_is_its_own(folder):
     assert len(set(seeds.values())) == 8
     planned(folder, one.format("b") + "seed = 8\n" + one.format("a"))
     again = read_plan(folder / "plan.toml").tasks
-    assert again["b.case-000"].seed == seeds["seed = 8\n", "b.case-000"]
-    assert again["a.case-001"].seed == seeds["", "a.case-001"]
+    assert again["b.bekker-0000"].seed == seeds["seed = 8\n", "b.bekker-0000"]
+    assert again["a.bekker-0001"].seed == seeds["", "a.bekker-0001"]
 
 
 def test_fits_are_files_by_models_by_priors_by_hold_outs(folder):
@@ -89,7 +89,7 @@ def test_the_documentations_plan_is_one(tmp_path):
     (plan.parent / "my_effects.py").write_text(EFFECT)
     (plan.parent / "wind.toml").write_text(WIND)
     tasks = read_plan(plan).tasks.values()
-    assert {t.kind for t in tasks} == {"fit", "diagnose", "challenge", "sbc"} == set(KINDS)
+    assert {t.kind for t in tasks} == {"fit", "diagnose", "sbc"} == set(KINDS)
 
 
 @pytest.mark.parametrize("inside", [True, False])
@@ -106,7 +106,7 @@ def test_an_effects_priors_are_in_its_class_or_beside_its_file(tmp_path, inside)
 
 FIT = '[[fit]]\nname = "a"\ndata = ["data/*.csv"]\nmodels = ["bekker"]\n'
 SBC = '[[sbc]]\nname = "a"\nsimulations = 1\ndraw_seed = 1\nmodels = ["bekkar"]\n'
-CASES = '[[challenge]]\nname = "a"\ndraw_seed = 1\n'
+RANKS = '[[sbc]]\nname = "a"\ndraw_seed = 1\nmodels = ["bekker"]\n'
 
 
 @pytest.mark.parametrize(
@@ -129,7 +129,7 @@ CASES = '[[challenge]]\nname = "a"\ndraw_seed = 1\n'
         (FIT.replace("bekker", "becker"), ["[[fit]], models", "becker", "bekker"]),
         (FIT.replace('"a"', '"a b"'), ["[[fit]], name", "'a b' will not do", "a word of"]),
         (FIT + FIT, ["[[fit]] number 2", "the name 'a' is that of"]),
-        (FIT + CASES + "cases = 1", ["[[challenge]]", "the name 'a' is that of"]),
+        (FIT + RANKS + "simulations = 1", ["[[sbc]]", "the name 'a' is that of"]),
         (FIT + 'priors = ["none.toml"]', ["[[fit]], priors", "no file 'none.toml'"]),
         (FIT + 'priors = ["soft.toml"]', ["soft.toml holds priors of magic_formula", "bekker"]),
         (FIT.replace("[\"bekker", "[\"magic_formula\", \"bekker") + 'priors = ["soft.toml"]',
@@ -138,10 +138,8 @@ CASES = '[[challenge]]\nname = "a"\ndraw_seed = 1\n'
         (SBC, ["[[sbc]], models", "bekkar"]),
         ('[[diagnose]]\nname = "a"\ncases = ["data"]', ["no folder with a case.toml", "'data'"]),
         ('[[diagnose]]\nname = "a"\ncases = ["cases/*"]\neffects = "e.py"', ["no file 'e.py'"]),
-        (CASES, ["cases is missing", "how many"]),
-        (CASES + "cases = 0", ["[[challenge]], cases", "0 will not do", "1 or more"]),
-        (CASES + "cases = 1\ntier = 'middling'", ["'middling' will not do", "'easy'"]),
-        (CASES + "cases = 1\nnull_fraction = 0.9", ["0.9 will not do", "0 to 0.7"]),
+        (RANKS, ["simulations is missing"]),
+        (RANKS + "simulations = 0", ["[[sbc]], simulations", "0 will not do", "1 or more"]),
     ],
 )  # fmt: skip
 def test_a_plan_that_will_not_do_says_where_and_what_would(folder, text, said):
