@@ -81,7 +81,8 @@ def plates(staged: ModuleType, fixed: float | None) -> Moments:
 
 def over_sigma(square: Array, rows: int) -> Array:
     """Integrate the likelihood over sigma, whose prior is log-normal about 1 N m: its logarithm."""
-    ln, at = np.linspace(-9.0, 9.0, 601), np.linspace(*np.log([square.min(), square.max()]), 500)
+    ln = np.linspace(-9.0, 9.0, 601)
+    at = np.linspace(np.log(square.min()), np.log(square.max()), 500)
     value = -0.5 * (ln / 1.5) ** 2 - rows * ln - 0.5 * np.exp(at[:, None] - 2.0 * ln)
     top = value.max(axis=1)
     return np.interp(np.log(square), at, top + np.log(np.exp(value - top[:, None]).sum(axis=1)))
