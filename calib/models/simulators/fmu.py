@@ -1,0 +1,84 @@
+"""Functional mock-up units (FMI 2.0 and 3.0), simulated by FMPy in processes of their own."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from calib.models.base import Array
+from calib.models.constants import FMU_CALLS
+from calib.models.simulators.process import call_function
+from calib.models.simulators.simulator import Failure, Given
+
+
+@dataclass(frozen=True)
+class FmuRunner:
+    """An FMU: parameters and conditions are start values of its variables.
+
+    It is simulated for each row of conditions, and outputs are those at the end; with `along` once,
+    to the last row, and outputs are series at steps of its own, which it gives under this name.
+    `experiment` has arguments of FMPy's ``simulate_fmu``. `limit` is in seconds for each process,
+    which makes so many simulations only: instances may keep memory and files of earlier ones.
+    """
+
+    path: Path
+    sha256: str
+    columns: tuple[str, ...]
+    experiment: Mapping[str, float]
+    along: str = ""
+    limit: float = 600.0
+
+    key: ClassVar[str] = "fmu"
+    runs: ClassVar[bool] = True
+
+    @property
+    def identity(self) -> str:
+        """The content of the FMU, and how it is simulated."""
+        return json.dumps(["fmu", self.sha256, self.columns, dict(self.experiment)])
+
+    def run(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Given:
+        """Simulate it."""
+        lists = {name: v.tolist() for name, v in conditions.items()}
+        n, given = next(iter(conditions.values())).size, {"output": list(self.columns)}
+        if times := lists.pop(self.along, None):
+            n, given = 1, given | {"stop_time": max(times)}
+        given |= self.experiment
+        starts = [{**parameters, **{name: v[i] for name, v in lists.items()}} for i in range(n)]
+        found: list[dict[str, Array]] = []
+        for i in range(0, n, FMU_CALLS):
+            # Unpacked here, because a process that is ended removes nothing.
+            with tempfile.TemporaryDirectory("", "calib-run-", ignore_cleanup_errors=True) as name:
+                told = (str(self.path), name, starts[i : i + FMU_CALLS], given)
+                made = call_function(simulated, told, self.limit)
+            if isinstance(made, Failure):
+                return made
+            found += made
+        if times:
+            return {self.along: found[0]["time"], **found[0]}
+        return {name: np.array([one[name][-1] for one in found]) for name in self.columns}
+
+
+def simulated(
+    path: str, folder: str, starts: Sequence[Mapping[str, float]], given: Mapping[str, Any]
+) -> list[dict[str, Array]]:
+    """Unpack an FMU in a folder and return its series for each set of start values."""
+    import fmpy
+
+    fmpy.extract(path, folder)
+    told = {"model_description": fmpy.read_model_description(folder, False)} | given
+    end = float(given.get("stop_time") or told["model_description"].defaultExperiment.stopTime)
+    found = []
+    for start in starts:
+        series = fmpy.simulate_fmu(folder, start_values=start, remote_platform=None, **told)
+        time = series["time"]
+        if not (time[-1] >= end or np.isclose(time[-1], end)):
+            raise RuntimeError(f"it ended at the time {time[-1]:g}, before {end:g}")
+        kept = np.append(np.diff(time) > 0.0, True)  # of an event the values after it
+        found.append({name: series[name][kept] for name in series.dtype.names})
+    return found
