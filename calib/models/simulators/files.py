@@ -60,6 +60,7 @@ class SimulatorFile(BaseModel):
     model: _Text = ""
     fmu: _Text = ""
     experiment: dict[_Given, float] = {}
+    variables: dict[str, str] = {}
     table: _Text = ""
     input: Literal["json", "csv", "template"] = "json"
     template: _Text = ""
@@ -301,26 +302,6 @@ def _umbridge(file: SimulatorFile, folder: Path) -> UmbridgeRunner:
 
 def _fmu(file: SimulatorFile, folder: Path) -> FmuRunner:
     sha256 = hashlib.sha256(_content(path := folder / file.fmu, "fmu", "FMU")).hexdigest()
-    known = _variables(path, file)
-    real = [name for name, v in known.items() if v.type in ("Real", "Float64", "Float32")]
-    headers = file.conditions | {own: getattr(o, "column", o) for own, o in file.outputs.items()}
-    taken = {*_without_noise(file), *file.conditions} - {file.along}
-    for name in (*sorted(taken), *file.outputs):
-        if name not in (real if name in taken else known):
-            raise _not_as_fmu(f"there is no real number {name}", ", ".join(real), "use its names")
-        column = parse_header(headers.get(name, ""))
-        has = known[name].unit or getattr(known[name].declaredType, "unit", None)
-        factor = 1.0
-        with suppress(CalibError):  # a unit that cannot be told
-            factor = float(convert(1.0, has, column.unit)) if has and column else 1.0
-        if column and abs(factor - 1.0) > 1e-9:
-            what = f"{name} is in {has}, and its column in {column.unit}"
-            raise _not_as_fmu(what, has, f"name a column in {has}")
-    return FmuRunner(path, sha256, tuple(file.outputs), file.experiment, file.along, file.limit)
-
-
-def _variables(path: Path, file: SimulatorFile) -> dict[str, Any]:
-    """Return the variables of an FMU that can be simulated here, as FMPy describes them."""
     try:
         import fmpy
 
@@ -334,7 +315,24 @@ def _variables(path: Path, file: SimulatorFile) -> dict[str, Any]:
     ends = getattr(found.defaultExperiment, "stopTime", None) or file.experiment.get("stop_time")
     if not file.along and ends is None:
         raise _not_as_fmu("it does not say when it ends", "stop_time", "add it to [experiment]")
-    return {v.name: v for v in found.modelVariables}
+    known = {v.name: v for v in found.modelVariables}
+    real = [name for name, v in known.items() if v.type in ("Real", "Float64", "Float32")]
+    headers = file.conditions | {own: getattr(o, "column", o) for own, o in file.outputs.items()}
+    own = [name for name in (*_without_noise(file), *headers) if name != file.along]
+    names = dict(zip(own, own, strict=True)) | file.variables
+    for name, variable in names.items():
+        if name not in own or variable not in (known if name in file.outputs else real):
+            raise _not_as_fmu(f"{name} is no real number of it", ", ".join(real), "name one")
+        column, factor = parse_header(headers.get(name, "")), 1.0
+        has = known[variable].unit or getattr(known[variable].declaredType, "unit", None)
+        with suppress(CalibError):  # a unit that cannot be told
+            factor = float(convert(1.0, has, column.unit)) if has and column else 1.0
+        if column and abs(factor - 1.0) > 1e-9:
+            raise _not_as_fmu(
+                f"{name} is in {has}, not in {column.unit}", has, "name such a column"
+            )
+    limits = file.experiment, file.along, file.limit
+    return FmuRunner(path, sha256, names, tuple(file.outputs), *limits)
 
 
 def _not_as_fmu(found: str, expected: str, hint: str) -> CalibError:
@@ -342,7 +340,6 @@ def _not_as_fmu(found: str, expected: str, hint: str) -> CalibError:
 
 
 def _without_noise(file: SimulatorFile) -> tuple[str, ...]:
-    """Return the parameters that the simulator takes."""
     noise = {"sigma", *(f"sigma_{own}" for own in file.outputs)}
     return (*(p for p in file.parameters if p not in noise), *file.derived)
 

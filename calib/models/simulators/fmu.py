@@ -19,7 +19,7 @@ from calib.models.simulators.simulator import Failure, Given
 
 @dataclass(frozen=True)
 class FmuRunner:
-    """An FMU: parameters and conditions are start values of its variables.
+    """An FMU: parameters and conditions are start values of its variables, named in `names`.
 
     It is simulated for each row of conditions, and outputs are those at the end; with `along` once,
     to the last row, and outputs are series at steps of its own, which it gives under this name.
@@ -29,6 +29,7 @@ class FmuRunner:
 
     path: Path
     sha256: str
+    names: Mapping[str, str]
     columns: tuple[str, ...]
     experiment: Mapping[str, float]
     along: str = ""
@@ -40,16 +41,20 @@ class FmuRunner:
     @property
     def identity(self) -> str:
         """The content of the FMU, and how it is simulated."""
-        return json.dumps(["fmu", self.sha256, self.columns, dict(self.experiment)])
+        return json.dumps(["fmu", self.sha256, dict(self.names), dict(self.experiment)])
 
     def run(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Given:
         """Simulate it."""
         lists = {name: v.tolist() for name, v in conditions.items()}
-        n, given = next(iter(conditions.values())).size, {"output": list(self.columns)}
+        n, given = (
+            next(iter(conditions.values())).size,
+            {"output": [self.names[c] for c in self.columns]},
+        )
         if times := lists.pop(self.along, None):
             n, given = 1, given | {"stop_time": max(times)}
         given |= self.experiment
-        starts = [{**parameters, **{name: v[i] for name, v in lists.items()}} for i in range(n)]
+        lists |= {name: [value] * n for name, value in parameters.items()}
+        starts = [{self.names[name]: v[i] for name, v in lists.items()} for i in range(n)]
         found: list[dict[str, Array]] = []
         for i in range(0, n, FMU_CALLS):
             # Unpacked here, because a process that is ended removes nothing.
@@ -59,9 +64,9 @@ class FmuRunner:
             if isinstance(made, Failure):
                 return made
             found += made
-        if times:
-            return {self.along: found[0]["time"], **found[0]}
-        return {name: np.array([one[name][-1] for one in found]) for name in self.columns}
+        last = {c: np.array([one[self.names[c]][-1] for one in found]) for c in self.columns}
+        series = {c: found[0][self.names.get(c, "time")] for c in (self.along, *self.columns)}
+        return series if times else last
 
 
 def simulated(

@@ -29,6 +29,8 @@ name = "wheel"
 fmu = "wheel.fmu"
 retries = 0
 {more}
+[variables]
+s0 = "tyre.s0"
 [conditions]
 slip = "slip_ratio"
 load = "normal_load_kn"
@@ -72,6 +74,7 @@ def declared(built: Path, folder: Path, text: str = FILE + PRIORS, more: str = "
     return read_simulator(folder / "wheel.toml")
 
 
+@pytest.mark.slow
 def test_the_posterior_is_that_of_the_formula(built: Path, tmp_path: Path) -> None:
     data = calib.table_from_arrays(lab(np.random.default_rng(1)))
     calib.register(declared(built, tmp_path))
@@ -131,11 +134,13 @@ def test_series_at_steps_of_its_own(built: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("mu]", "mue]", ["no real number mue", "mu, s0"]),
-        ("slip = ", "skid = ", ["no real number skid"]),
-        ("pull = ", "pull_ = ", ["no real number pull_"]),
-        ("drawbar_pull_n", "drawbar_pull_kn", ["pull is in N, and its column in kN"]),
-        ('"normal_load_kn"', '"normal_load_n"', ["load is in kN, and its column in N"]),
+        ("mu]", "mue]", ["mue is no real number", "mu, tyre.s0"]),
+        ('"tyre.s0"', '"tyre.s1"', ["s0 is no real number"]),
+        ('s0 = "t', 's1 = "t', ["s0 is no real number"]),
+        ("slip = ", "skid = ", ["skid is no real number"]),
+        ("pull = ", "pull_ = ", ["pull_ is no real number"]),
+        ("drawbar_pull_n", "drawbar_pull_kn", ["pull is in N, not in kN"]),
+        ('"normal_load_kn"', '"normal_load_n"', ["load is in kN, not in N"]),
         ('fmu = "wheel.fmu"', 'fmu = "wheel.toml"', ["the FMU cannot be read", "not a zip file"]),
         ('fmu = "wheel.fmu"', 'fmu = "other.fmu"', ["the FMU cannot be read"]),
         ("[conditions]", "[experiment]\nstop = 3\n[conditions]", ["experiment.stop"]),

@@ -11,7 +11,7 @@ import fmpy
 
 VARIABLES = (
     ("mu", "parameter", "fixed", ' start="0.5"'),
-    ("s0", "parameter", "fixed", ' start="0.1"'),
+    ("tyre.s0", "parameter", "fixed", ' start="0.1"'),
     ("z0", "parameter", "fixed", ' start="10"'),
     ("tau", "parameter", "fixed", ' start="1"'),
     ("slip", "input", "continuous", ' start="0"'),
