@@ -328,9 +328,7 @@ def _fmu(file: SimulatorFile, folder: Path) -> FmuRunner:
         with suppress(CalibError):  # a unit that cannot be told
             factor = float(convert(1.0, has, column.unit)) if has and column else 1.0
         if column and abs(factor - 1.0) > 1e-9:
-            raise _not_as_fmu(
-                f"{name} is in {has}, not in {column.unit}", has, "name such a column"
-            )
+            raise _not_as_fmu(f"{name} is in {has}, not in {column.unit}", has, f"declare {has}")
     limits = file.experiment, file.along, file.limit
     return FmuRunner(path, sha256, names, tuple(file.outputs), *limits)
 
