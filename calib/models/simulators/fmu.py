@@ -31,7 +31,7 @@ class FmuRunner:
     sha256: str
     names: Mapping[str, str]
     columns: tuple[str, ...]
-    experiment: Mapping[str, float]
+    experiment: Mapping[Any, float]
     along: str = ""
     limit: float = 600.0
 
@@ -46,13 +46,10 @@ class FmuRunner:
     def run(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Given:
         """Simulate it."""
         lists = {name: v.tolist() for name, v in conditions.items()}
-        n, given = (
-            next(iter(conditions.values())).size,
-            {"output": [self.names[c] for c in self.columns]},
-        )
+        given = {"output": [self.names[c] for c in self.columns], **self.experiment}
+        n = next(iter(conditions.values())).size
         if times := lists.pop(self.along, None):
-            n, given = 1, given | {"stop_time": max(times)}
-        given |= self.experiment
+            n, given["stop_time"] = 1, given.get("stop_time", max(times))
         lists |= {name: [value] * n for name, value in parameters.items()}
         starts = [{self.names[name]: v[i] for name, v in lists.items()} for i in range(n)]
         found: list[dict[str, Array]] = []
@@ -76,11 +73,13 @@ def simulated(
     import fmpy
 
     fmpy.extract(path, folder)
-    told = {"model_description": fmpy.read_model_description(folder, False)} | given
-    end = float(given.get("stop_time") or told["model_description"].defaultExperiment.stopTime)
+    described = fmpy.read_model_description(folder, False)
+    end = float(given.get("stop_time") or described.defaultExperiment.stopTime)
     found = []
     for start in starts:
-        series = fmpy.simulate_fmu(folder, start_values=start, remote_platform=None, **told)
+        series = fmpy.simulate_fmu(
+            folder, model_description=described, start_values=start, remote_platform=None, **given
+        )
         time = series["time"]
         if not (time[-1] >= end or np.isclose(time[-1], end)):
             raise RuntimeError(f"it ended at the time {time[-1]:g}, before {end:g}")
