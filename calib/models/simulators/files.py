@@ -317,12 +317,12 @@ def _fmu(file: SimulatorFile, folder: Path) -> FmuRunner:
         raise _not_as_fmu("it does not say when it ends", "stop_time", "add it to [experiment]")
     known = {v.name: v for v in found.modelVariables}
     real = [name for name, v in known.items() if v.type in ("Real", "Float64", "Float32")]
-    headers = {own: str(getattr(o, "column", o)) for own, o in file.outputs.items()}
-    headers = file.conditions | headers
+    outputs = {own: str(getattr(o, "column", o)) for own, o in file.outputs.items()}
+    headers = file.conditions | outputs
     own = [name for name in (*_without_noise(file), *headers) if name != file.along]
     names = dict(zip(own, own, strict=True)) | file.variables
     for name, variable in names.items():
-        if name not in own or variable not in (known if name in file.outputs else real):
+        if name not in own or variable not in (known if name in outputs else real):
             raise _not_as_fmu(f"{name} is no real number of it", ", ".join(real), "name one")
         column, factor = parse_header(headers.get(name, "")), 1.0
         has = known[variable].unit or getattr(known[variable].declaredType, "unit", None)
@@ -330,8 +330,7 @@ def _fmu(file: SimulatorFile, folder: Path) -> FmuRunner:
             factor = float(convert(1.0, has, column.unit)) if has and column else 1.0
         if has and column and abs(factor - 1.0) > 1e-9:
             raise _not_as_fmu(f"{name} is in {has}, not in {column.unit}", has, f"declare {has}")
-    columns = tuple(file.outputs)
-    return FmuRunner(path, sha256, names, columns, file.experiment, file.along, file.limit)
+    return FmuRunner(path, sha256, names, tuple(outputs), file.experiment, file.along, file.limit)
 
 
 def _not_as_fmu(found: str, expected: str, hint: str) -> CalibError:

@@ -34,7 +34,6 @@ class FmuRunner:
     experiment: Mapping[Any, float]
     along: str = ""
     limit: float = 600.0
-
     key: ClassVar[str] = "fmu"
     runs: ClassVar[bool] = True
 
@@ -49,7 +48,7 @@ class FmuRunner:
         given = {"output": [self.names[c] for c in self.columns], **self.experiment}
         n = next(iter(conditions.values())).size
         if times := lists.pop(self.along, None):
-            n, given["stop_time"] = 1, given.get("stop_time", max(times))
+            n, given["until"] = 1, max(times)
         lists |= {name: [value] * n for name, value in parameters.items()}
         starts = [{self.names[name]: v[i] for name, v in lists.items()} for i in range(n)]
         found: list[dict[str, Array]] = []
@@ -73,16 +72,19 @@ def simulated(
     import fmpy
 
     fmpy.extract(path, folder)
-    described = fmpy.read_model_description(folder, False)
-    end = float(given.get("stop_time") or described.defaultExperiment.stopTime)
+    described: Any = fmpy.read_model_description(folder, False)
+    planned, co = described.defaultExperiment, described.coSimulation
+    told = {"model_description": described, "remote_platform": None, **given}
+    end = told.get("until") or told.get("stop_time") or planned.stopTime
+    if "until" in told:  # and to the end of a step, where an FMU has such
+        step = getattr(co, "fixedInternalStepSize", None) or getattr(planned, "stepSize", None)
+        step = float(given.get("output_interval") or step or 0.0)
+        told.setdefault("stop_time", told.pop("until") + step)
     found = []
     for start in starts:
-        series = fmpy.simulate_fmu(
-            folder, model_description=described, start_values=start, remote_platform=None, **given
-        )
-        time = series["time"]
-        if not (time[-1] >= end or np.isclose(time[-1], end)):
-            raise RuntimeError(f"it ended at the time {time[-1]:g}, before {end:g}")
-        kept = np.append(np.diff(time) > 0.0, True)  # of an event the values after it
+        series = fmpy.simulate_fmu(folder, start_values=start, **told)
+        kept = np.append(np.diff(time := series["time"]) > 0.0, True)  # after an event, not before
+        if not (time[-1] >= float(end) or np.isclose(time[-1], float(end))):
+            raise RuntimeError(f"it ended at the time {time[-1]:g}, before {end}")
         found.append({name: series[name][kept] for name in series.dtype.names})
     return found
