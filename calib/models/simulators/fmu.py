@@ -23,8 +23,7 @@ class FmuRunner:
 
     It is simulated for each row of conditions, and outputs are those at the end; with `along` once,
     to the last row, and outputs are series at steps of its own, which it gives under this name.
-    `experiment` has arguments of FMPy's ``simulate_fmu``. `limit` is in seconds for each process,
-    which makes so many simulations only: instances may keep memory and files of earlier ones.
+    `experiment` has arguments of FMPy's ``simulate_fmu``. `limit` is in seconds for each process.
     """
 
     path: Path
