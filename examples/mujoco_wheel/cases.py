@@ -3,8 +3,9 @@
     python cases.py [FOLDER]
 
 The laboratory is the rig at a time step of 2 ms. In the field it is the same (`null`), or has a
-withheld effect: another friction (`friction`), a force gauge with a zero error (`offset`), a step
-of 20 ms (`coarse`), steps from 2 to 20 ms (`steps`). All have 0.03 kN of noise.
+withheld effect: a step of 20 ms (`coarse`), four steps from 2 to 20 ms (`steps`), both 2 and 20 ms
+(`two_steps`), a force gauge with a zero error (`offset`), another friction (`friction`). All have
+0.03 kN of noise.
 """
 
 import sys
@@ -17,10 +18,11 @@ TRUE = (0.75, 0.02, 1.0)  # mu, soft (s), damped
 NOISE_KN = 0.03
 FIELDS = {
     "null": {},
-    "friction": {"theta": (0.6, 0.02, 1.0)},
-    "offset": {"offset_kn": 0.15},
     "coarse": {"steps": (20.0,)},
     "steps": {"steps": (2.0, 5.0, 10.0, 20.0)},
+    "two_steps": {"steps": (2.0, 20.0)},
+    "offset": {"offset_kn": 0.15},
+    "friction": {"theta": (0.6, 0.02, 1.0)},
 }
 CASE = """calibration = "lab.csv"
 field = "field.csv"
@@ -33,24 +35,25 @@ time_step_ms = "number"
 """
 
 
-def campaign(rng, path, rows, theta=TRUE, steps=(STEP_MS,), offset_kn=0.0):
-    """Write so many readings of the rig."""
+def campaign(rng, rows, theta=TRUE, steps=(STEP_MS,), offset_kn=0.0):
+    """Return so many readings of the rig, a row each."""
     slip, load = rng.uniform((0.003, 2.0), (0.045, 6.0), (rows, 2)).T
     step_ms = np.resize(steps, rows)
     kn = pull(theta, {"slip": slip, "load": load}, step_ms) / 1000.0 + offset_kn
     kn = kn + NOISE_KN * rng.standard_normal(rows)
-    head = "slip_ratio,normal_load_kn,time_step_ms,drawbar_pull_kn"
-    table = np.stack([slip, load, step_ms, kn], axis=1)
-    np.savetxt(path, table, "%.5f", ",", header=head, comments="")
+    return np.stack([slip, load, step_ms, kn], axis=1)
 
 
 def main(folder, seed=1):
     """Write all cases, with one laboratory."""
-    for place, (name, changed) in enumerate(FIELDS.items()):
+    rng = np.random.default_rng(seed)
+    lab = campaign(rng, 24)
+    head = "slip_ratio,normal_load_kn,time_step_ms,drawbar_pull_kn"
+    for name, changed in FIELDS.items():
         (folder / name).mkdir(parents=True, exist_ok=True)
         (folder / name / "case.toml").write_text(CASE)
-        campaign(np.random.default_rng(seed), folder / name / "lab.csv", 24)
-        campaign(np.random.default_rng([seed, place]), folder / name / "field.csv", 32, **changed)
+        for file, table in (("lab.csv", lab), ("field.csv", campaign(rng, 32, **changed))):
+            np.savetxt(folder / name / file, table, "%.5f", ",", header=head, comments="")
 
 
 if __name__ == "__main__":

@@ -60,5 +60,5 @@ def test_a_withheld_offset_is_found(run: Calib) -> None:
 
 
 def test_a_recorded_time_step_is_found(run: Calib) -> None:
-    found = diagnosed(run, "steps")
+    found = diagnosed(run, "two_steps")
     assert probabilities(found)["depends_on_time_step_ms"] > 0.9
