@@ -308,6 +308,7 @@ def doctor(
         "crate": ("rocrate", "`calib export --ro-crate`"),
         "dashboard": ("bokeh", "Dask's page of what the workers do"),
         "docs": ("sphinx", "the documentation of a checkout"),
+        "fmu": ("fmpy", "simulators that are FMUs"),
         "import": ("python-calamine", "workbooks and Parquet for `calib import`"),
         "test": ("pytest", "the tests of a checkout"),
     }

@@ -282,7 +282,7 @@ def _parts(white: Array, psi: Array, split: bool, rng: np.random.Generator) -> t
     length = np.linalg.norm(white, axis=1, keepdims=True)
     where = np.zeros(len(white), dtype=int)
     if split:
-        shape = white / length * np.log1p(length)
+        shape = white / np.maximum(length, 1e-300) * np.log1p(length)  # some may do nothing
         _, where = kmeans2(shape, PARTS, minit="++", seed=rng)
     found = []
     for label in np.unique(where):

@@ -15,6 +15,8 @@ KILL_SECONDS = 5.0
 # If the first runs all fail, the file or the program is wrong: by chance this happens once in 32
 # times at most if the simulator has values in half of its prior; tests/inference/emulation
 FIRST_RUNS = 5
+# Of an FMU in one process; some stop after 1030 (CATIA-Systems/FMPy#608); simulators/test_fmu.py
+FMU_CALLS = 500
 
 # Emulators; tests/models/simulators/test_emulator.py
 # Nuggets over conditions, of which the smallest that gives a factor is taken.

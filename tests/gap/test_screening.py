@@ -481,3 +481,15 @@ def test_a_field_as_noisy_as_the_laboratory_stays_green_whatever_its_columns():
     assert found.verdict == "none"
     assert found.doubts == ()
     assert gap_verdict(found).tone is Tone.FINE
+
+
+def test_an_effect_that_most_of_its_prior_leaves_without_trace_is_weighed():
+    case = make_case(None, models=PULL_ONLY)
+    small = {
+        name: replace(table, columns=dict(table.columns) | {"slip_ratio": table["slip_ratio"] / 14})
+        for name, table in (("lab", case.lab), ("field", case.field))
+    }
+    some = {"post_peak_softening": EFFECTS["post_peak_softening"]}
+    _, ranking, _ = screened_ranking(replace(case, **small), 1, some)
+    assert "post_peak_softening" not in ranking.not_testable
+    assert 0.0 < ranking.probability["post_peak_softening"] < 0.5

@@ -1,1 +1,1 @@
-"""Simulators of the user's own: four ways in, one contract, every run kept, slow ones emulated."""
+"""Simulators of the user's own: five ways in, one contract, every run kept, slow ones emulated."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import shlex
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,10 +13,12 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from calib.batch.user_code import load, run_file
 from calib.data.files import TOML_HINT, read_text, read_toml
+from calib.data.quantities import convert
 from calib.data.table import parse_header
 from calib.errors import CalibError, in_words, meant
 from calib.models.simulators.declaration import SIMULATED, EmulationSettings, Simulated, declare
 from calib.models.simulators.emulator import use_emulator
+from calib.models.simulators.fmu import FmuRunner
 from calib.models.simulators.runner import (
     CallableRunner,
     CommandRunner,
@@ -33,6 +36,7 @@ def _without_null(text: str) -> str:
 
 
 _Text = Annotated[str, AfterValidator(_without_null)]
+_Given = Literal["start_time", "stop_time", "step_size", "output_interval", "relative_tolerance"]
 
 
 class OutputTable(BaseModel):
@@ -44,7 +48,7 @@ class OutputTable(BaseModel):
 
 
 class SimulatorFile(BaseModel):
-    """What a simulator file may say; exactly one of run, python, url and table."""
+    """What a simulator file may say; exactly one of run, python, url, fmu and table."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     name: str = Field(pattern=r"^[A-Za-z]\w*$")
@@ -54,6 +58,9 @@ class SimulatorFile(BaseModel):
     python: _Text = ""
     url: _Text = ""
     model: _Text = ""
+    fmu: _Text = ""
+    experiment: dict[_Given, float] = {}
+    variables: dict[str, str] = {}
     table: _Text = ""
     input: Literal["json", "csv", "template"] = "json"
     template: _Text = ""
@@ -202,12 +209,13 @@ def _runner(file: SimulatorFile, folder: Path) -> Runner:
     if file.along and (file.rows == "each" or file.table):
         raise CalibError(
             "series are neither of a table of runs nor called for row by row", where="along",
-            expected='rows = "all", and run, python or url', hint="leave along out",
+            expected='rows = "all", and run, python, url or fmu', hint="leave along out",
         )  # fmt: skip
     makers: dict[str, Callable[[SimulatorFile, Path], Runner]] = {
         "run": _command,
         "python": _callable,
         "url": _umbridge,
+        "fmu": _fmu,
         "table": _of_table,
     }
     given = [key for key in makers if getattr(file, key)]
@@ -261,9 +269,7 @@ def _template(file: SimulatorFile, folder: Path) -> str:
         template = read_text(folder / file.template)
     except (OSError, UnicodeDecodeError) as error:
         raise _unreadable("template", error, "template") from None
-    noise = {"sigma", *(f"sigma_{own}" for own in file.outputs)}
-    names = tuple(p for p in file.parameters if p not in noise)
-    check_template(template, (*names, *file.derived, *file.conditions), f"template {file.template}")
+    check_template(template, (*_without_noise(file), *file.conditions), f"template {file.template}")
     return template
 
 
@@ -292,6 +298,48 @@ def _umbridge(file: SimulatorFile, folder: Path) -> UmbridgeRunner:
         )
     rows: Literal["each", "config"] = "each" if file.rows == "each" else "config"
     return UmbridgeRunner(file.url, file.model, tuple(file.outputs), rows, file.limit)
+
+
+def _fmu(file: SimulatorFile, folder: Path) -> FmuRunner:
+    sha256 = hashlib.sha256(_content(path := folder / file.fmu, "fmu", "FMU")).hexdigest()
+    try:
+        import fmpy
+
+        found, systems = fmpy.read_model_description(path, False), fmpy.supported_platforms(path)
+    except ModuleNotFoundError:
+        raise _not_as_fmu("FMPy is missing", "fmpy", "pip install 'terracalib[fmu]'") from None
+    except Exception as error:  # of any kind, for whatever is wrong in it
+        raise _unreadable("FMU", error, "fmu") from None
+    if fmpy.platform not in systems:
+        raise _not_as_fmu(f"it is for {systems}", fmpy.platform, "export it for this system")
+    ends = getattr(found.defaultExperiment, "stopTime", None) or file.experiment.get("stop_time")
+    if not file.along and ends is None:
+        raise _not_as_fmu("it does not say when it ends", "stop_time", "add it to [experiment]")
+    known = {v.name: v for v in found.modelVariables}
+    real = [name for name, v in known.items() if v.type in ("Real", "Float64", "Float32")]
+    outputs = {own: str(getattr(o, "column", o)) for own, o in file.outputs.items()}
+    headers = file.conditions | outputs
+    own = [name for name in (*_without_noise(file), *headers) if name != file.along]
+    names = dict(zip(own, own, strict=True)) | file.variables
+    for name, variable in names.items():
+        if name not in own or variable not in (known if name in outputs else real):
+            raise _not_as_fmu(f"{name} is no real number of it", ", ".join(real), "name one")
+        column, factor = parse_header(headers.get(name, "")), 1.0
+        has = known[variable].unit or getattr(known[variable].declaredType, "unit", None)
+        with suppress(CalibError):  # a unit that cannot be told
+            factor = float(convert(1.0, has, column.unit)) if has and column else 1.0
+        if has and column and abs(factor - 1.0) > 1e-9:
+            raise _not_as_fmu(f"{name} is in {has}, not in {column.unit}", has, f"declare {has}")
+    return FmuRunner(path, sha256, names, tuple(outputs), file.experiment, file.along, file.limit)
+
+
+def _not_as_fmu(found: str, expected: str, hint: str) -> CalibError:
+    return CalibError(found, where="fmu", expected=expected, hint=hint)
+
+
+def _without_noise(file: SimulatorFile) -> tuple[str, ...]:
+    noise = {"sigma", *(f"sigma_{own}" for own in file.outputs)}
+    return (*(p for p in file.parameters if p not in noise), *file.derived)
 
 
 def _of_table(file: SimulatorFile, folder: Path) -> TableRunner:
