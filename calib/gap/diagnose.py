@@ -30,6 +30,7 @@ from calib.gap.corrected import (
     shrink,
 )
 from calib.gap.effects import EFFECTS, Effect, View
+from calib.gap.effects.dependence import PREFIX, DependsOn
 from calib.gap.effects.user import check_effects
 from calib.gap.fit import Fit
 from calib.gap.hypotheses import inseparable, singles, unusual_sizes, with_case_effects
@@ -307,14 +308,26 @@ def _confounded(data: Campaigns, causes: Inclusion, effects: Mapping[str, Effect
     """Warn of causes that go with a condition which differs between the campaigns only."""
     # What a user declared is of interest, however probable it is.
     own = set(data.case.covariates)
-    return [
-        f"{name}: its condition is one value in the laboratory and another in the field; what "
-        "depends on it cannot be separated from anything else that changed between them"
-        for name, effect in effects.items()
-        if name in causes.causes
-        and (causes.causes[name].probability >= WORTH_SAYING or own & set(effect.covariates))
-        and inseparable(data, effect)
-    ]
+    said, hidden = list[str](), list[str]()
+    for name, effect in effects.items():
+        if name not in causes.causes or not inseparable(data, effect):
+            continue
+        if causes.causes[name].probability >= WORTH_SAYING or own & set(effect.covariates):
+            said.append(
+                f"{name}: its condition is one value in the laboratory and another in the field; "
+                "what depends on it cannot be separated from anything else that changed between "
+                "them"
+            )
+        elif isinstance(effect, DependsOn):
+            hidden.append(name.removeprefix(PREFIX).replace("_", " "))
+    shift = causes.causes.get("parameter_shift")
+    if hidden and shift is not None and shift.probability >= WORTH_SAYING:
+        said.append(
+            f"parameter_shift: {', '.join(hidden)} also differed between the campaigns and did not "
+            "vary in the field; the simulator ignores it, and other parameter values may be its "
+            "effect. Measure at several values of it in the field to find out"
+        )
+    return said
 
 
 def _without_context(
