@@ -52,17 +52,6 @@ def average(marks: Marks, group: str, method: str, measure: str) -> float | None
     return float(np.exp(mean)) if measure in ("before", "after") else mean
 
 
-def summary(marks: Marks) -> dict[str, dict[str, dict[str, float | None]]]:
-    """Averages by data set, method and measure."""
-    return {
-        group: {
-            method: {m: average(marks, group, method, m) for m in (*MEASURES, "before", "seconds")}
-            for method in dict.fromkeys(m["method"] for m in marks)
-        }
-        for group in groups(marks)
-    }
-
-
 def lead(marks: Marks, group: str, method: str, measure: str) -> tuple[float, str]:
     """By how much a rival is better on the cases that both have, and that in words."""
     mine, other = (values(marks, group, m, measure) for m in (CALIB, method))
