@@ -101,8 +101,12 @@ class Fit:
         """Of the readings; where theta is the laboratory's, with what it is uncertain by."""
         c = self.kernel(hyper, self.x, self.x) + np.exp(2.0 * hyper[-1]) * np.eye(self.n)
         if not self.own:
-            c += self._by_theta(self.conditions)
+            c += self._by_theta_here
         return c + 1e-10 * np.trace(c) / self.n * np.eye(self.n)
+
+    @cached_property
+    def _by_theta_here(self) -> Array:
+        return self._by_theta(self.conditions)
 
     def _by_theta(self, at: Conditions) -> Array:
         """Covariance of the calibrated simulator with that at the field rows."""
