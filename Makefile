@@ -8,7 +8,7 @@ OUT ?= out/he2019
 # Small matrices: threads of the linear algebra would only wait for each other.
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: report reference test test-slow coverage browser crates docs bench lint format install-check release-check clean
+.PHONY: report reference test test-slow coverage browser crates docs bench rivals lint format install-check release-check clean
 
 report: $(READY)
 	$(BIN)/calib report --out $(OUT) --overwrite
@@ -57,6 +57,13 @@ docs: $(VENV)/.docs
 BENCH_IN := $(if $(filter-out everyday --%,$(or $(PART),all)),$(BENCH_VENV),$(VENV))
 bench: $(BENCH_IN)/.ready
 	$(BENCH_IN)/bin/python benchmarks/bench.py $(PART)
+
+# calib against other methods on the measured cases, in out/rivals; HALF=--set-aside for those that are looked at once.
+rivals: $(BENCH_VENV)/.ready
+	rm -rf out/rivals/made
+	$(BENCH_VENV)/bin/python -m challenge.measured --out out/rivals/made --leave-out 4 --cases-only $(HALF)
+	cd benchmarks && ../$(BENCH_VENV)/bin/python -m rivals.run --cases ../out/rivals/made/cases \
+	  --answers ../out/rivals/made/answers --out ../out/rivals
 
 lint: $(READY)
 	$(BIN)/ruff check calib challenge tests benchmarks docs
