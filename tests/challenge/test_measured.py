@@ -27,9 +27,10 @@ from challenge.measured.marks import documented, markdown, wrong
 from challenge.seal import open_answers
 
 CASES = read_cases()
-REPORT = (Path(__file__).parents[2] / "reports" / "measured.md").read_text(encoding="utf-8")
+PAGE = Path(__file__).parents[2] / "reports" / "challenge" / "measured.md"
+REPORT, _, SECOND = PAGE.read_text(encoding="utf-8").partition("\n## The 53 of the second draw")
 FIRST = [c for c in CASES if f"\n| {c.name} |" in REPORT]
-"""The cases of the first draw; those that came later are drawn and reported by themselves."""
+LATER = [c for c in CASES if c not in FIRST]
 READINGS = ("drift", "gain", "offset", "step")
 
 
@@ -215,3 +216,15 @@ def test_the_stored_report_keeps_what_was_set_aside_apart() -> None:
     for case in FIRST:
         row = f"\n| {case.name} |"
         assert (row in set_aside, row in worked_on) == (case.set_aside, not case.set_aside)
+
+
+def test_of_the_second_draw_half_is_set_aside_and_the_other_half_reported() -> None:
+    rng = np.random.default_rng(20261129)
+    drawn = set[str]()
+    for null, size in ((False, 21), (True, 5)):
+        names = sorted(c.name for c in LATER if (c.expected == NONE) == null)
+        drawn |= set(rng.choice(names, size, replace=False))
+    assert {c.name for c in LATER if c.set_aside} == drawn
+    assert {c.name for c in LATER if f"\n| {c.name} |" in SECOND} == {
+        c.name for c in LATER if not c.set_aside
+    }

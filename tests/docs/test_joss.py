@@ -22,10 +22,10 @@ ELSEWHERE = "".join(
 )
 # Evidence that is quoted, and the words that say it in the place that it is from.
 QUOTED = {
-    "46 of 47 easy cases": ("reports/challenge.md", "46/47 (0.979)"),
-    "36 of 47 hard": ("reports/challenge.md", "36/47"),
-    "All 101 first": ("reports/challenge.md", "101 of 101"),
-    "7 of 9 cases": ("reports/measured.md", "7 of 9"),
+    "46 of 47 easy cases": ("reports/challenge/blind.md", "46/47 (0.979)"),
+    "36 of 47 hard": ("reports/challenge/blind.md", "36/47"),
+    "All 101 first": ("reports/challenge/blind.md", "101 of 101"),
+    "7 of 9 cases": ("reports/challenge/measured.md", "7 of 9"),
     "1,800 data sets": ("reports/sbc.md", "1,800 data sets"),
     "87 quantities": ("reports/sbc.md", "87 quantities"),
     "0.072": ("docs/statistics/diagnosis.md", "0.072"),
