@@ -93,6 +93,7 @@ def main(folder, program, only=()):
         "domain": ({"active_domain": domains}, {}, 0.0),
         "rays": ({"ray_casting": rays}, {}, 0.0),
         "coarse": ({"mesh_mm": 50.0}, {}, 0.0),
+        "mesh_both": ({"mesh_mm": np.resize([10, 12.5, 20, 25, 40, 50], n)}, {}, 0.0),
     }
     for name, (recorded, simulated, added) in fields.items():
         errors = rng.standard_normal((2, n))

@@ -57,10 +57,10 @@ def main(folder, only=()):
         found = factor * sand(asked, folder) * np.exp(NOISE_LOG * rng.standard_normal(n))
         return rows, found
 
-    speed, load = np.meshgrid([0.5, 1.0, 1.5, 2.0, 3.0], [50.0, 100.0, 150.0, 200.0])
+    speed, load = np.meshgrid([1.0, 1.5, 2.0, 2.5, 3.0], [100.0, 130.0, 160.0, 200.0])
     lab = readings(speed.ravel(), load.ravel())
     n = 24
-    speeds, loads = rng.uniform(0.5, 3, n).round(2), rng.uniform(50, 200, n).round(0)
+    speeds, loads = rng.uniform(1, 3, n).round(2), rng.uniform(100, 200, n).round(0)
     cells = rng.permutation(np.resize([32.0, 40.0, 48.0, 56.0, 64.0], n))
     steps = rng.permutation(np.resize([0.05, 0.1], n))
     fields = {
