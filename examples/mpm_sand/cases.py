@@ -2,8 +2,8 @@
 
     python cases.py FOLDER [case]...
 
-The laboratory has 40 cells per metre and steps of 0.1 ms. Each field differs in one thing only;
-noise and places of particles are new.
+The laboratory has 40 cells per metre and steps of 0.1 ms. Each field repeats its settings and
+differs in one thing only; noise and places of particles are new.
 """
 
 import csv
@@ -59,8 +59,7 @@ def main(folder, only=()):
 
     speed, load = np.meshgrid([1.0, 1.5, 2.0, 2.5, 3.0], [100.0, 130.0, 160.0, 200.0])
     lab = readings(speed.ravel(), load.ravel())
-    n = 24
-    speeds, loads = rng.uniform(1, 3, n).round(2), rng.uniform(100, 200, n).round(0)
+    n = speed.size
     cells = rng.permutation(np.resize([32.0, 40.0, 48.0, 56.0, 64.0], n))
     steps = rng.permutation(np.resize([0.05, 0.1], n))
     fields = {
@@ -76,7 +75,7 @@ def main(folder, only=()):
         case = folder / name
         case.mkdir(exist_ok=True)
         write(case / "lab.csv", *lab)
-        write(case / "field.csv", *readings(speeds, loads, **given))
+        write(case / "field.csv", *readings(speed.ravel(), load.ravel(), **given))
         declared = {"cells": 'cells_per_m = "number"\n', "steps": 'time_step_ms = "number"\n'}
         (case / "case.toml").write_text(CASE + "".join(declared.get(key, "") for key in given))
         print(name, flush=True)
