@@ -289,23 +289,21 @@ def _wait_for(url: str, server: subprocess.Popen[bytes]) -> None:
 
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "chrono_scm"
-# Stands for a program around Chrono: it reads the soil in the order of SetSoilParameters.
+# Stands for the rig: it reads the soil by the names of SetSoilParameters.
 PROGRAM = """#!{python}
+import csv
 import sys
-import time
-import urllib.request
-lines = [line.split() for line in open(sys.argv[1]) if not line.startswith("#")]
-values = {{name: [float(v) for v in rest] for name, *rest in lines}}
-assert [line[0] for line in lines][:6] == [
-    "Bekker_Kphi", "Bekker_Kc", "Bekker_n", "Mohr_cohesion", "Mohr_friction", "Janosi_shear"
-]
-for slip, load in zip(values["slip"], values["load"]):
-    print(f"Fx = {{load * slip * values['Mohr_friction'][0] / 30:.6f}} N")
+rows = list(csv.DictReader(open(sys.argv[1])))
+print("pull,torque,sinkage")
+for row in rows:
+    load, slip, friction, kphi = (float(row[k]) for k in ("load", "slip", "friction", "Kphi"))
+    print(load * slip * friction / 30, 0, load / kphi, sep=",")
 """
 
 
 def test_chronos_parameters_have_its_order_and_units(tmp_path: Path) -> None:
-    shutil.copytree(EXAMPLE, tmp_path / "scm")
+    (tmp_path / "scm").mkdir()
+    shutil.copy(EXAMPLE / "scm.toml", tmp_path / "scm")
     program = tmp_path / "scm" / "chrono_wheel"
     program.write_text(PROGRAM.format(python=sys.executable))
     program.chmod(0o755)
@@ -316,3 +314,4 @@ def test_chronos_parameters_have_its_order_and_units(tmp_path: Path) -> None:
     found = simulator.run(theta, x)
     assert not isinstance(found, Failure), found
     np.testing.assert_allclose(found["drawbar_pull_kn"], [0.4, 1.0])
+    np.testing.assert_allclose(found["rut_depth_mm"], [2.0, 2.5])
