@@ -420,9 +420,10 @@ def foreseen(
     """Say how many runs will be needed, by a power of their number, and what would lower it."""
     if state.scatters:
         return _SCATTERS
-    runs, errors = np.array(history).T
+    # A field's emulator begins before any run of its own.
+    runs, errors = np.array([entry for entry in history if entry[0] > 0]).reshape(-1, 2).T
     said = "how many cannot be foreseen, for the error does not fall as it should"
-    if len(history) > 1:
+    if runs.size > 1:
         slope, level = np.polyfit(np.log(runs), np.log(np.maximum(errors, 1e-300)), 1)
         needed = float(np.exp((np.log(chosen.tolerance) - level) / slope)) if slope < 0 else np.inf
         rounded = plain_number(needed, 2)

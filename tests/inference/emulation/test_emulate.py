@@ -349,9 +349,13 @@ def test_no_fewer_runs_are_foreseen_than_were_made(made: int, words: str) -> Non
     keeper = RunKeeper(SIMULATED["slow"].simulator)
     state = State([problem], keeper, problem.conditions, 1, most=200)
     state.runs = [Run(np.zeros(2), {})] * made
-    said = foreseen(state, np.zeros((9, 2)), EmulationSettings(), [(75, 0.213), (150, 0.107)])
+    errors = [(75, 0.213), (150, 0.107)]
+    said = foreseen(state, np.zeros((9, 2)), EmulationSettings(), errors)
     assert words in said
     assert said.count("runs") == ("some" in said)
+    # What a field's emulator is worth before any run of its own says nothing of its runs.
+    assert foreseen(state, np.zeros((9, 2)), EmulationSettings(), [(0, 0.4), *errors]) == said
+    assert "cannot" in foreseen(state, np.zeros((9, 2)), EmulationSettings(), [(0, 0.4)])
 
 
 def test_slow_simulators_are_not_called_by_the_sampler() -> None:
