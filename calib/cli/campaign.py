@@ -248,6 +248,7 @@ def score(
     section: Annotated[
         str, typer.Option(help="Name of the cases on that page; by default the folder's.")
     ] = "",
+    plugins: opt.Models = None,
     overwrite: opt.Overwrite = False,
     json: opt.Json = False,
 ) -> None:
