@@ -408,6 +408,10 @@ class Forward:
             }
         return FieldPrediction(self, psi, view, plain, idle)
 
+    def along(self, view: View) -> Array | None:
+        """Return what a shift is multiplied by, shape (n,); None if it is all over the field."""
+        return self._along.shape(view) if self._along else None
+
     def shifted(
         self,
         psi: Array,
@@ -422,7 +426,7 @@ class Forward:
             return predict(t, misfit, conditions)
         shift = psi[:, self.shift_slice]
         moved, error = shift @ self.shift.parameters[name].T, shift @ self.shift.radius_error
-        along = self._along.shape(view) if self._along else None
+        along = self.along(view)
         if along is None:
             return predict(t + moved, misfit, _shifted(error, conditions))
         values = np.unique(along)
