@@ -409,8 +409,13 @@ class Forward:
         return FieldPrediction(self, psi, view, plain, idle)
 
     def along(self, view: View) -> Array | None:
-        """Return what a shift is multiplied by, shape (n,); None if it is all over the field."""
-        return self._along.shape(view) if self._along else None
+        """Return what a shift is multiplied by, shape (n,); None if it is all over the field.
+
+        The condition, in a unit in which it is at most one in the field: where it has one value
+        there, parameters shift along it by as much as by themselves.
+        """
+        u, own = (self._along.shape(v) if self._along else None for v in (view, self.data.view))
+        return None if u is None or own is None else u / max(1.0, float(np.abs(own).max()))
 
     def shifted(
         self,
