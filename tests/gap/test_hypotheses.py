@@ -162,10 +162,11 @@ def test_a_condition_that_the_simulator_ignores_is_named_as_the_cause():
 
 def test_a_dependence_is_as_often_one_of_the_parameters_in_every_size(data):
     ignored = dependences(campaigns(with_load(np.array([5.0]), np.array([4.0, 8.0]), 1.0)))
-    (single,) = singles(data, {"load": ignored["depends_on_normal_load"]})
+    name = "depends_on_normal_load"
+    (single,) = singles(data, {name: ignored[name]})
     found = {(h.shift_over, h.shift): h.share for h in by_parameters(replace(single, share=0.2))}
     assert found == pytest.approx(
-        {("", 0.0): 0.1} | {(single.name, size): 0.1 / len(SHIFTS) for size in SHIFTS}
+        {("", 0.0): 0.1} | {(name, size): 0.1 / len(SHIFTS) for size in SHIFTS}
     )
     (other,) = singles(data, {"force_offset": EFFECTS["force_offset"]})
     assert by_parameters(other) == [other]
