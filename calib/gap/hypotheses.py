@@ -108,7 +108,6 @@ _COVERED_BY = {
     "passes": "multipass_compaction",
     "water": "moisture_softening",
     "slip": "slip_sinkage",
-    "pressure": "pressure_gauge_bias",
 }
 # Roles of conditions that go with each other: who knows one of them ignores none.
 _SAME: Mapping[str, set[str]] = {
