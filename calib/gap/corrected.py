@@ -36,7 +36,7 @@ from calib.shown import Shown
 from calib.validation.prediction import echoed, outside
 from calib.validation.questions import Drawn, Sample, Weights
 
-SCHEMA = "calib/corrected/6"
+SCHEMA = "calib/corrected/7"
 
 
 class Corrected:
@@ -150,6 +150,7 @@ def _fit_document(fit: Fit, probability: float) -> dict[str, Any]:
         "effects": [e.name for e in h.effects],
         "shift": h.shift,
         "shift_as": h.shift_as,
+        "shift_over": h.shift_over,
         "shift_map": _shift_document(fit.forward.shift),
         "smooth": h.smooth,
         "smooth_outputs": list(h.smooth_outputs),
@@ -253,6 +254,7 @@ def _load_fit(
         document["smooth_over"],
         document["smooth_decay"],
         document["onset_over"],
+        shift_over=document["shift_over"],
     )
     noise = {o: Noise(**n) for o, n in document["noise"].items()}
     # What the coordinates of a shift mean is the file's, whatever the priors shipped now say.

@@ -261,7 +261,8 @@ def _covered(found: Diagnosis) -> dict[str, tuple[float, float]]:
 def _explanation(found: Diagnosis, name: str, prior: float, placebo: Placebo) -> doc.Explanation:
     ranking = found.ranking
     fit = ranking.best(name)
-    shift = fit.forward.hypothesis.shift_as if fit.forward.hypothesis.shift > 0.0 else ""
+    h = fit.forward.hypothesis
+    shift = h.shift_as if h.shift > 0.0 and not h.shift_over else ""
     return doc.Explanation(
         name,
         ranking.probability[name],
@@ -329,18 +330,22 @@ def shifts(outputs: Sequence[OutputData], fit: Fit) -> Iterator[doc.Parameter]:
     """Find the shifts of the simulators' parameters that stand out from their own sd.
 
     Those of logarithms are relative, in percent; so is the rolling radius, by its empty name.
+    Along a condition they are those at the field's value that is farthest from the laboratory's.
     """
     part, shift = fit.forward.shift_slice, fit.forward.shift
     if shift is None:
         return
+    along = fit.forward.along(fit.forward.data.view)
+    far = 1.0 if along is None else float(along[np.abs(along).argmax()])
     rows = [
         (o.name, prior, row)
         for o in outputs
+        if o.name in shift.parameters
         for prior, row in zip(o.priors.free, shift.parameters[o.name], strict=True)
     ]
     for output, prior, row in [*rows, ("", None, shift.radius_error)]:
-        value = float(row @ fit.psi[part])
-        sd = float(row @ fit.covariance[part, part] @ row) ** 0.5
+        value = far * float(row @ fit.psi[part])
+        sd = abs(far) * float(row @ fit.covariance[part, part] @ row) ** 0.5
         if abs(value) < _Z * sd or (prior is None and value == 0.0):
             continue
         name, unit = (prior.name, prior.unit) if prior is not None else ("", "percent")

@@ -6,7 +6,7 @@ The vector psi of a hypothesis stacks, all with (truncated) normal or uniform pr
     inadequacy of each simulator, in the lab and the field alike
     parameters of each effect
     form errors of each effect: what it adds is its formula's times max(1 + sum_j c_j b_j(x), 0)
-    shifts of the simulator's parameters in the field (parameter_shift only)
+    shifts of the simulator's parameters in the field (parameter_shift, or along a condition)
     coefficients of a free smooth discrepancy (unknown only)
 
 What hypotheses add to the simulators' predictions: their effects, form errors, discrepancies.
@@ -14,7 +14,7 @@ What hypotheses add to the simulators' predictions: their effects, form errors, 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -29,6 +29,9 @@ from calib.gap.hypotheses import Hypothesis, widened
 from calib.inference.priors import Prior, Priors
 from calib.inference.random import latin
 from calib.models.base import Array
+
+# Values of a condition at which shifted simulators are evaluated at most; linear between them.
+_MOST_VALUES = 9
 
 # A prediction without a value is none, whatever the warnings.
 _SILENT = np.errstate(all="ignore")
@@ -126,7 +129,6 @@ def _added(
 ) -> list[Array | None]:
     """What each effect adds to one output by the conditions that truly held, by its formula."""
     role, simulated = forward.roles[name], forward.simulated[name]
-    t, misfit = psi[:, forward.theta_slices[name]], psi[:, forward.misfit_slices[name]]
     recorded = simulated.conditions(view)
     conditions = {known: recorded[column] for known, column in simulated.columns.items()}
     ahead = plain
@@ -139,7 +141,7 @@ def _added(
         if all(found[known] is values for known, values in conditions.items()):
             continue
         at = {simulated.columns[known]: values for known, values in found.items()}
-        there = simulated.predict_beyond(t, misfit, at)
+        there = forward.shifted(psi, name, view, at, simulated.predict_beyond)
         added[-1] = there - ahead
         ahead, conditions = there, found
     return added
@@ -225,8 +227,10 @@ class Forward:
         }
         self.shift_slice = slice(len(entries), len(entries))
         self.shift: ShiftMap | None = None
+        self._along = next((e for e in hypothesis.effects if e.name == hypothesis.shift_over), None)
         if hypothesis.shift > 0.0:
-            current, relative = shift_map(data.outputs, hypothesis.shift_as)
+            there = [o for o in data.outputs if not self._along or o.role in self._along.outputs]
+            current, relative = shift_map(there, hypothesis.shift_as)
             self.shift = current if shift is None else shift
             shifts = [_normal("field.shift", hypothesis.shift * sd) for sd in relative]
             self.shift_slice = _append(entries, shifts)
@@ -376,14 +380,14 @@ class Forward:
     def causes(self) -> tuple[str, ...]:
         """What acts: effects by name, ``parameter_shift``, and ``unknown`` for a discrepancy."""
         names = [e.name for e in self.hypothesis.effects]
-        names += ["parameter_shift"] if self.shift is not None else []
+        names += ["parameter_shift"] if self.shift is not None and not self._along else []
         return (*names, *(["unknown"] if self.smooth_slices else []))
 
     @_SILENT
     def without(self, psi: Array, view: View, *left_out: str) -> dict[str, Array]:
         """Predict field rows with all of `causes` in force but some."""
         rest = psi.copy()
-        if "parameter_shift" in left_out:
+        if (self.hypothesis.shift_over or "parameter_shift") in left_out:
             rest[:, self.shift_slice] = 0.0
         if "unknown" in left_out:
             for part in self.smooth_slices.values():
@@ -398,19 +402,49 @@ class Forward:
     ) -> FieldPrediction:
         """Prepare field rows, of which `plain` is what the simulators say without a shift."""
         if self.shift is not None:
-            shift, error = (
-                psi[:, self.shift_slice],
-                psi[:, self.shift_slice] @ self.shift.radius_error,
-            )
             plain = {
-                name: s.predict(
-                    psi[:, self.theta_slices[name]] + shift @ self.shift.parameters[name].T,
-                    psi[:, self.misfit_slices[name]],
-                    _shifted(error, s.conditions(view)),
-                )
+                name: self.shifted(psi, name, view, s.conditions(view), s.predict)
                 for name, s in self.simulated.items()
             }
         return FieldPrediction(self, psi, view, plain, idle)
+
+    def along(self, view: View) -> Array | None:
+        """Return what a shift is multiplied by, shape (n,); None if it is all over the field.
+
+        The condition, in a unit in which it is at most one in the field: where it has one value
+        there, parameters shift along it by as much as by themselves.
+        """
+        u, own = (self._along.shape(v) if self._along else None for v in (view, self.data.view))
+        return None if u is None or own is None else u / max(1.0, float(np.abs(own).max()))
+
+    def shifted(
+        self,
+        psi: Array,
+        name: str,
+        view: View,
+        conditions: dict[str, Array],
+        predict: Callable[[Array, Array, dict[str, Array]], Array],
+    ) -> Array:
+        """Predict one output with a shift, along a condition if it goes with it, shape (k, n)."""
+        t, misfit = psi[:, self.theta_slices[name]], psi[:, self.misfit_slices[name]]
+        if self.shift is None or name not in self.shift.parameters:
+            return predict(t, misfit, conditions)
+        shift = psi[:, self.shift_slice]
+        moved, error = shift @ self.shift.parameters[name].T, shift @ self.shift.radius_error
+        along = self.along(view)
+        if along is None:
+            return predict(t + moved, misfit, _shifted(error, conditions))
+        values = np.unique(along)
+        if values.size > _MOST_VALUES:
+            values = np.linspace(values[0], values[-1], _MOST_VALUES)
+        mean = np.zeros((len(psi), along.size))
+        for u, one in zip(values, np.eye(values.size), strict=True):
+            weight = np.interp(along, values, one)
+            rows = np.flatnonzero(weight)
+            here = {column: v[..., rows] for column, v in conditions.items()}
+            there = predict(t + u * moved, misfit, _shifted(u * error, here))
+            mean[:, rows] += weight[rows] * there
+        return mean
 
     @_SILENT
     def field_and_plain(self, psi: Array, view: View) -> tuple[dict[str, Array], dict[str, Array]]:

@@ -83,6 +83,9 @@ class Hypothesis:
         and a part of the output's level.
     share : float
         Part of the prior probability of its name.
+    shift_over : str
+        One of the effects, a dependence: parameters shift in proportion to its condition, which is
+        then no cause of its own.
     """
 
     name: str
@@ -96,6 +99,7 @@ class Hypothesis:
     smooth_decay: float = 4.0
     onset_over: OnsetOver | None = None
     share: float = 1.0
+    shift_over: str = ""
 
 
 # Conditions that listed effects are about, and those effects.
@@ -104,7 +108,6 @@ _COVERED_BY = {
     "passes": "multipass_compaction",
     "water": "moisture_softening",
     "slip": "slip_sinkage",
-    "pressure": "pressure_gauge_bias",
 }
 # Roles of conditions that go with each other: who knows one of them ignores none.
 _SAME: Mapping[str, set[str]] = {
@@ -370,8 +373,17 @@ def shifts(data: Campaigns) -> list[Hypothesis]:
     ]
 
 
+def by_parameters(single: Hypothesis) -> list[Hypothesis]:
+    """An effect, and if it is a dependence as often one that shifts parameters along as well."""
+    if not isinstance(single.effects[0], DependsOn):
+        return [single]
+    half = 0.5 * single.share
+    along = replace(single, shift_over=single.name, share=half / len(SHIFTS))
+    return [replace(single, share=half), *(replace(along, shift=size) for size in SHIFTS)]
+
+
 def joined(*causes: Hypothesis) -> Hypothesis:
-    """Several effects at once, named in alphabetical order."""
+    """Several effects at once, named in alphabetical order; along one at most parameters shift."""
     parts = [
         (e.name, e, p) for h in causes for e, p in zip(h.effects, h.effect_priors, strict=True)
     ]
@@ -380,7 +392,9 @@ def joined(*causes: Hypothesis) -> Hypothesis:
         "+".join(name for name, _, _ in parts),
         tuple(effect for _, effect, _ in parts),
         tuple(priors for _, _, priors in parts),
+        shift=max(h.shift for h in causes),
         share=float(np.prod([h.share for h in causes])),
+        shift_over=max(h.shift_over for h in causes),
     )
 
 

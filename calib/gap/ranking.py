@@ -26,6 +26,7 @@ from calib.gap.effects import EFFECTS, Effect
 from calib.gap.fit import Fit
 from calib.gap.hypotheses import (
     Hypothesis,
+    by_parameters,
     joined,
     prior_share,
     shifts,
@@ -159,6 +160,7 @@ def rank(
     unable |= dict.fromkeys(context.excluded, "it is excluded in the case's [context]")
     alone -= set(context.excluded)
     odds = Odds.of(len(single) - len(alone), context)
+    single = [variant for h in single for variant in by_parameters(h)]
     screen = Screen(data, lab_mode, noise, seed)
     candidates, tried = _candidates(screen, odds, single, alone)
     fits, scores = _scored(screen, candidates, odds, seed, plenty)
@@ -223,18 +225,18 @@ def _candidates(
         if of_parts := [screen.choice(((cause, i),)) for i in range(len(cause.parts))]:
             found.append(Candidate.of(h, odds, cause.ln_relevant, of_parts))
     causes = [screen.cause(h) for h in single]
-    groups = dict[tuple[str, ...], list[Choice]]()
+    groups = dict[tuple[int, ...], list[Choice]]()
     for choice in [
         *screen.choices([c for c in causes if c.name not in alone]),
         *screen.choices([c for c in causes if c.name in alone], most=1),
     ]:
-        groups.setdefault(tuple(sorted(c.name for c, _ in choice.parts)), []).append(choice)
-    hypotheses = {h.name: h for h in single}
-    for names, group in groups.items():
+        groups.setdefault(tuple(sorted(id(c) for c, _ in choice.parts)), []).append(choice)
+    for group in groups.values():
         some = [cause for cause, _ in group[0].parts]
         relevant = sum(c.ln_relevant_in_set for c in some)
         relevant = some[0].ln_relevant if len(some) == 1 else relevant
-        found.append(Candidate.of(joined(*(hypotheses[n] for n in names)), odds, relevant, group))
+        h = joined(*(cause.forward.hypothesis for cause in some))
+        found.append(Candidate.of(h, odds, relevant, group))
     found = _restricted(found)
     found += _restricted(_with_residuals(screen, odds, found))
     least = max(c.promise for c in found) - CUT

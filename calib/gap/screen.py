@@ -329,6 +329,12 @@ def places(old: Forward, new: Forward) -> tuple[Array, Array]:
     return theirs, ours
 
 
+def _go_together(one: Cause, other: Cause) -> bool:
+    """Whether two are in one set: no variants of one name, and one shift of parameters at most."""
+    shifts = one.forward.shift is not None and other.forward.shift is not None
+    return one.name != other.name and not shifts
+
+
 class _Beam:
     """Choices of parts, enlarged by one cause after the other."""
 
@@ -336,6 +342,7 @@ class _Beam:
         self._screen = screen
         every = [(j, i, p) for j, c in enumerate(causes) for i, p in enumerate(c.parts)]
         self._of = np.array([j for j, _, _ in every])
+        self._go_together = np.array([[_go_together(a, b) for a in causes] for b in causes])
         self._labels = [(causes[j], i) for j, i, _ in every]
         self._ln_share = np.array([p.ln_share for _, _, p in every])
         roots = np.zeros((len(every), RANK, screen.rows.size))
@@ -384,7 +391,8 @@ class _Beam:
             for parts in level:
                 # Every pair once; larger sets from whichever of their parts is in the beam.
                 later = self._of > self._of[parts[-1]] if size == 1 else True
-                allowed = np.flatnonzero(later & ~np.isin(self._of, self._of[list(parts)]))
+                able = self._go_together[self._of[list(parts)]].all(axis=0)[self._of]
+                allowed = np.flatnonzero(later & able)
                 if allowed.size:
                     share = self._ln_share[list(parts)].sum() + self._ln_share[allowed]
                     values = (self._enlarge(parts, allowed) + share).tolist()

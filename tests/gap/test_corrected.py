@@ -30,7 +30,7 @@ from calib.gap.effects import EFFECTS
 from calib.gap.effects.user import load_effects
 from calib.gap.fit import Fit
 from calib.gap.forward import Forward
-from calib.gap.hypotheses import Hypothesis, joined, singles
+from calib.gap.hypotheses import Hypothesis, by_parameters, joined, singles, with_case_effects
 from calib.gap.mixture import Mixture, Truth, mixture
 from calib.gap.noise import Noise
 from calib.gap.predict import predict
@@ -120,8 +120,10 @@ def made() -> Corrected:
     lab_mode = {o.name: np.array([p.loc for p in o.priors.free]) + 0.01 for o in data.outputs}
     pull = ("drawbar_pull",)
     few = singles(data, {n: EFFECTS[n] for n in ("sensor_drift", "rate_effect")})
+    known = with_case_effects(data, EFFECTS)
+    (ageing,) = singles(data, {n: known[n] for n in ("depends_on_tyre_age_weeks",)})
     hypotheses = [
-        joined(*few),
+        joined(*few, by_parameters(ageing)[-1]),
         Hypothesis("parameter_shift", shift=0.25, shift_as="soil"),
         Hypothesis("unknown", smooth=2.0, smooth_outputs=pull, smooth_over="slip",
                    smooth_decay=3.0),
@@ -146,8 +148,8 @@ def test_everything_is_kept(made, kept):
         np.testing.assert_allclose(again.lab_mode[name], mode, rtol=1e-12)
     for was, now in zip(made.mixture.fits, again.mixture.fits, strict=True):
         h, found = was.forward.hypothesis, now.forward.hypothesis
-        for part in ("name", "shift", "shift_as", "smooth", "smooth_outputs", "smooth_over",
-                     "smooth_decay", "onset_over"):  # fmt: skip
+        for part in ("name", "shift", "shift_as", "shift_over", "smooth", "smooth_outputs",
+                     "smooth_over", "smooth_decay", "onset_over"):  # fmt: skip
             assert getattr(found, part) == getattr(h, part)
         assert [e.name for e in found.effects] == [e.name for e in h.effects]
         assert now.forward.priors.entries == was.forward.priors.entries

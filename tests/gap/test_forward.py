@@ -12,7 +12,7 @@ from calib.data.quantities import role_of
 from calib.errors import CalibError
 from calib.gap import discrepancy as module
 from calib.gap.campaigns import Campaigns, campaigns
-from calib.gap.constants import RADIUS_ERROR
+from calib.gap.constants import RADIUS_ERROR, SHIFTS
 from calib.gap.corrected import Corrected, load_corrected, predict_columns, save_corrected
 from calib.gap.describe import shifts as shift_sizes
 from calib.gap.discrepancy import ZERO_OF_SLIP, Discrepancy, another_soil, quantities
@@ -21,6 +21,8 @@ from calib.gap.fit import Fit
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import (
     Hypothesis,
+    by_parameters,
+    dependences,
     effect_priors,
     joined,
     shifts,
@@ -35,7 +37,7 @@ from calib.inference.prior_files import default_priors
 from calib.models import MODELS as KNOWN
 from tests.gap.cases import MODELS, NOISE, campaigns_of
 from tests.gap.fits import draws_of
-from tests.gap.test_hypotheses import density_campaigns
+from tests.gap.test_hypotheses import density_campaigns, with_load
 
 SIGMA = {o: NOISE[o] for o in ("drawbar_pull", "rut_depth")}
 
@@ -246,6 +248,58 @@ def test_a_shift_moves_the_parameters_and_the_zero_of_slip(data, shift_as):
         truly = conditions | {"slip_ratio": 1.0 - (1.0 - slip) * (1.0 - error)}
         expected = o.problem.bound.mean_response(o.priors.to_natural(t), truly)
         np.testing.assert_allclose(found[o.name], expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("loads", "near"), [(3, 1e-12), (27, 2e-3)])
+def test_along_an_ignored_condition_parameters_shift_by_so_much_in_each_row(loads, near):
+    """A wrong radius acts at the shifted parameters; of many loads, linear between nine."""
+    data = campaigns(with_load(np.array([5.0]), np.linspace(2.0, 8.0, loads), 0.0))
+    name = "depends_on_normal_load"
+    (ignored,) = singles(data, {name: dependences(data)[name]})
+    h = joined(single(data, "slip_zero_shift"), by_parameters(ignored)[-1])
+    assert (h.shift, h.shift_over) == (SHIFTS[-1], name)
+    forward, (o,) = Forward(data, h, SIGMA), data.outputs
+    assert forward.causes == (name, "slip_zero_shift")
+    psi = centre(forward, 3)
+    size = (3, forward.n_dim - forward.n_shared)
+    psi[:, forward.n_shared :] = 0.05 * np.random.default_rng(6).standard_normal(size)
+    for part in forward.form_slices[o.name]:
+        psi[:, part] = 0.0
+    load, slip = data.view.of("load"), data.view.slip()
+    assert np.unique(load).size > loads / 2
+    u = np.log(load / 5.0)
+
+    def expected(shift, radius, phi):
+        """One row after the other."""
+        found = np.empty((3, slip.size))
+        for i in range(slip.size):
+            t = psi[:, forward.theta_slices[o.name]]
+            t = t + u[i] * shift @ forward.shift.parameters[o.name].T
+            error = u[i] * shift @ forward.shift.radius_error
+            truly = 1.0 - (1.0 - slip[i]) * (1.0 - radius) * (1.0 - error)
+            at = {"slip_ratio": truly[:, None]}
+            found[:, i] = o.problem.bound.mean_response(o.priors.to_natural(t), at)[:, 0]
+        return h.effects[0].on_output(phi, o.role, found, data.view)
+
+    phi, radius = (psi[:, part] for part in forward.phi_slices)
+    every = psi[:, forward.shift_slice], radius[:, 0], phi
+    plain = forward.simulator(psi, data.view)[o.name]
+    for left_out, kept in ((), (1, 1, 1)), (["slip_zero_shift"], (1, 0, 1)), ([name], (0, 1, 0)):
+        found = forward.without(psi, data.view, *left_out)[o.name]
+        right = expected(*(k * part for k, part in zip(kept, every, strict=True)))
+        np.testing.assert_allclose(found, right, rtol=0.0, atol=near)
+        assert np.abs(found - plain).max() > 0.02
+
+
+@pytest.mark.parametrize(("field", "farthest"), [(8.0, np.log(8.0 / 5.0)), (50.0, 1.0)])
+def test_parameters_shift_along_a_condition_by_as_much_as_by_themselves_at_most(field, farthest):
+    data = campaigns(with_load(np.array([5.0]), np.array([5.0, field]), 0.0))
+    name = "depends_on_normal_load"
+    (ignored,) = singles(data, {name: dependences(data)[name]})
+    forward = Forward(data, by_parameters(ignored)[-1], SIGMA)
+    assert forward.along(data.view).max() == pytest.approx(farthest)
+    there = data.at_conditions({"slip_ratio": np.array([0.2]), "normal_load_kn": np.array([5.0])})
+    assert forward.along(there) == pytest.approx(0.0)
 
 
 def test_form_errors_scale_what_each_effect_adds_to_those_before_it(data):

@@ -18,6 +18,7 @@ from calib.gap.effects import EFFECTS
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import (
     Hypothesis,
+    by_parameters,
     dependences,
     effect_priors,
     inseparable,
@@ -28,7 +29,7 @@ from calib.gap.hypotheses import (
     unknowns,
     with_residual_discrepancy,
 )
-from tests.gap.cases import MODELS, NOISE, PULL_ONLY, campaigns_of, make_case
+from tests.gap.cases import MODELS, NOISE, PULL_ONLY, TRUTH, campaigns_of, make_case
 
 SIGMA = {o: NOISE[o] for o in MODELS}
 
@@ -157,6 +158,47 @@ def test_a_condition_that_the_simulator_ignores_is_named_as_the_cause():
     assert load.probability > 0.9
     assert load.share > 0.6
     assert not inseparable(found.data, dependences(found.data)["depends_on_normal_load"])
+
+
+def test_a_dependence_is_as_often_one_of_the_parameters_in_every_size(data):
+    ignored = dependences(campaigns(with_load(np.array([5.0]), np.array([4.0, 8.0]), 1.0)))
+    name = "depends_on_normal_load"
+    (single,) = singles(data, {name: ignored[name]})
+    found = {(h.shift_over, h.shift): h.share for h in by_parameters(replace(single, share=0.2))}
+    assert found == pytest.approx(
+        {("", 0.0): 0.1} | {(name, size): 0.1 / len(SHIFTS) for size in SHIFTS}
+    )
+    (other,) = singles(data, {"force_offset": EFFECTS["force_offset"]})
+    assert by_parameters(other) == [other]
+
+
+def softer(exponent: float, everywhere: float) -> Case:
+    """A slip stiffness that goes with the load, which the simulator ignores, or is another."""
+    case = with_load(np.array([5.0]), np.array([3.0, 5.0, 8.0]), 0.0)
+    load, slip = case.field["normal_load_kn"], case.field["slip_ratio"]
+    truth, bound = TRUTH["magic_formula"], campaigns(case).outputs[0].problem.bound
+
+    def pull(stiffness: np.ndarray) -> np.ndarray:
+        theta = np.array([[*(truth | {"K": k}).values()] for k in stiffness])
+        return np.diag(bound.mean_response(theta, {"slip_ratio": slip}))
+
+    stiff = truth["K"] * everywhere * (load / 5.0) ** exponent
+    change = pull(stiff) - pull(np.full(slip.size, truth["K"]))
+    columns = {**case.field.columns, "drawbar_pull_kn": case.field["drawbar_pull_kn"] + change}
+    return replace(case, field=replace(case.field, columns=columns))
+
+
+@pytest.mark.parametrize(
+    ("exponent", "everywhere", "cause"),
+    [(0.8, 1.0, "depends_on_normal_load"), (0.0, 0.5, "parameter_shift")],
+)
+def test_a_condition_that_changes_the_shape_of_a_curve_is_named_and_another_curve_is_not(
+    exponent, everywhere, cause
+):
+    found = diagnose_once(softer(exponent, everywhere), 1)
+    acting = {name: c.probability for name, c in found.inclusion.causes.items()}
+    assert acting.pop(cause) > 0.9
+    assert max(acting.values()) < 0.1
 
 
 def test_a_condition_that_differs_between_the_campaigns_only_is_said_to_be_inseparable():

@@ -9,6 +9,11 @@ of it count (normal load, speed), else the difference over half the range of bot
 with c, b of each output, and a of the pull. Forces on a wheel are nearly proportional to the load
 (c = 1), by dimensional analysis at constant contact pressure; about that c is free.
 
+As often the condition acts through the simulator's parameters as well, theta + delta u in the place
+of theta with |u| <= 1 in the field (`Forward.along`): it changes the shape of the curve, not only
+its scale. The prior of delta is that of a parameter shift, so that one other value of the condition
+is told from a shift by what is known beforehand alone.
+
 Of a category (operator, site) each value has a factor of its own, ln z' = ln z + d_j or
 y' = y exp(d_j) + a_j W, with none for the one that is most frequent in the laboratory.
 """
