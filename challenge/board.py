@@ -31,7 +31,7 @@ _NOTES = """\
   prediction it counts as 1, what the mean of the true values would miss by.
 - Calibration error: mean distance between the probability of the first explanation and how often
   such are right, in ten bins. The Brier score is 0 at best and 2 at worst.
-- Seconds: median over cases, wall clock on one machine.
+- Seconds: median over cases, on one machine.
 - Failed cases count as wrong everywhere but in the calibration error. Intervals are of 95 %
   (Jeffreys, or a bootstrap). Dashed: the levels asked for of measured cases, 0.75, 0.95 and 0.10.
 """
@@ -141,8 +141,9 @@ def board_figure(lines: Mapping[str, Line], title: str) -> Figure:
         Of which cases.
     """
     figure = Figure(figsize=(12.0, 1.7 + 0.42 * len(lines)), layout="constrained")
-    panels = figure.subplots(1, len(_PANELS), sharey=True, squeeze=False)[0]
-    for axes, (name, label, more_is_better, level) in zip(panels, _PANELS, strict=True):
+    shown = [p for p in _PANELS if any(getattr(one, p[0]).n for one in lines.values())]
+    panels = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
+    for axes, (name, label, more_is_better, level) in zip(panels, shown, strict=True):
         for i, one in enumerate(lines.values()):
             got: Proportion | Average = getattr(one, name)
             if got.n:
