@@ -108,6 +108,7 @@ def test_the_same_seed_gives_the_same_cases_on_any_number_of_workers(blind, beli
             assert (tmp_path / root.name / path.relative_to(root)).read_bytes() == path.read_bytes()
 
 
+@pytest.mark.slow
 def test_they_are_diagnosed_and_scored_as_any_case(believed, tmp_path):
     folders = case_folders(believed[0])
     assert diagnose_cases(folders[:2], tmp_path / "results", 1) == {}
