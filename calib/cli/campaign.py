@@ -252,7 +252,7 @@ def score(
     overwrite: opt.Overwrite = False,
     json: opt.Json = False,
 ) -> None:
-    """Compare diagnoses with the answers; with --out or --json those of the first program."""
+    """Compare diagnoses with the answers; --out and --json report the first program only."""
     from dataclasses import asdict
 
     with from_the_bench("calib challenge score"):

@@ -154,10 +154,9 @@ def validate(
 ) -> None:
     """Judge whether your readings are consistent with a reference campaign, or check a case.
 
-    Of a run it ends with 0 where they are, 1 where they are not, 2 where no row can be judged, 3
-    where the reference did not converge. Of a case folder it lists everything that does not follow
-    the format, of the answer and the diagnosis too, and ends with 0 if there is nothing, 1 if there
-    is.
+    For a run, the exit code is 0 if they are, 1 if they are not, 2 if no row can be judged, and 3
+    if the reference did not converge. For a case folder, every departure from the format is listed,
+    those of the answer and the diagnosis included; the exit code is 0 if there is none, else 1.
     """
     if file is None:
         from calib.batch.environment import from_the_bench
@@ -174,7 +173,9 @@ def validate(
         return
     if answer is not None or diagnosis is not None:
         raise CalibError(
-            "--answer and --diagnosis are of a case", where=str(file), hint="leave FILE out"
+            "--answer and --diagnosis apply to a case folder only",
+            where=str(file),
+            hint="leave FILE out",
         )
     from calib import consistency, load_calibration
     from calib.data import read_for_model

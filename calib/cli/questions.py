@@ -44,7 +44,7 @@ PeakOver = Annotated[
         "over the range it has in the file, at each setting of the others."
     ),
 ]
-_OTHER_UNIT = 100.0  # times any reading: a bound that large is rather in another unit
+_OTHER_UNIT = 100.0  # times any reading: a bound that large is probably in another unit
 _POINTS = 101  # of a curve whose peak is sought, a parabola between them
 
 
